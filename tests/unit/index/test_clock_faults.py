@@ -103,10 +103,7 @@ def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
-@given(
-    st.lists(st.integers(0, 40), min_size=2, max_size=20),
-    st.integers(1, 6),
-)
+@given(st.lists(st.integers(0, 40), min_size=2, max_size=20), st.integers(1, 6))
 def test_steps_are_those_between_neighbours_however_the_history_is_parted(
     starts: list[int], size: int
 ) -> None:

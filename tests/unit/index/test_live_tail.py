@@ -14,12 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.handover_file import (
-    Counting,
-    Handover,
-    Overlap,
-    write_handover,
-)
+from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View

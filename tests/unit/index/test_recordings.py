@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.spans import overlap_spans
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S
+from ros2_memory.history.context import Memory
 from ros2_memory.index import listed_splits, recordings, timeline
 from ros2_memory.index.listed_splits import Absent
 from ros2_memory.index.recordings import Overlapping, name_of, overlapping_recordings, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, text, write_mcap
@@ -115,14 +114,6 @@ def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, sid
     assert overlapping(taken) == ()
 
 
-def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
-    spans = {"a": (0, 10), "moments/20261120T080000Z-cup/a": (5, 15), "b": (8, 20)}
-    taken = robot(tmp_path, spans)
-    assert pairs(overlapping(taken)) == [("a", "b", 8.0, 15.0)]
-    write_handover(tmp_path / "b", Handover(previous="a"))
-    assert overlapping(taken) == ()
-
-
 def test_two_robots_are_found_behind_however_many_handovers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,14 +144,6 @@ def test_times_that_recordings_share_are_those_of_all_their_bags(
         patch.setattr(timeline, "SEGMENT_BAGS", size)
         shared = timeline.Timeline.of(bags).shared_times
     assert shared == overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
-
-
-def test_recordings_may_overlap_where_the_range_of_times_ends(tmp_path: Path) -> None:
-    for name, before in (("a", NS_PER_S), ("b", NS_PER_S // 2)):
-        said = [text(MAX_NS - 1 - before, name), text(MAX_NS - 1, name)]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", said)
-    [topic] = list_recorded_topics(memory_of(tmp_path), Call())
-    assert topic.count == 4
 
 
 T0_NS = T0 * NS_PER_S

@@ -13,11 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import (
-    BagError,
-    BagVanishedError,
-    EpisodicError,
-)
+from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import BagReader, Batch, Closing, Record
 from tests.support.bags import Msg, boolean, odom, text, tf, transform

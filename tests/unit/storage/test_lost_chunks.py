@@ -17,14 +17,11 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import View
+from ros2_memory.history.context import Memory
 from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
 from ros2_memory.storage.mcap import bulk
-from ros2_memory.storage.mcap.bulk import ReadChunks
-from ros2_memory.storage.mcap.chunk import MessageTable
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
@@ -34,7 +31,6 @@ from tests.support.memories import asked, memory_of, with_store
 
 S = 10**9
 
-T0 = 1_700_000_000 * S
 
 LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
 
@@ -122,33 +118,6 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
         assert "a_0.mcap could not be read whole" in found["notes"][0]
 
 
-@pytest.mark.parametrize("newest_first", [False, True])
-def test_what_is_read_for_copies_alone_is_not_reported_when_it_is_damaged(
-    tmp_path: Path, newest_first: bool
-) -> None:
-    memory = overlapping(tmp_path)
-    view = View(memory, Call())
-    found = view.stream.messages(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
-    assert len(list(found)) == 2
-    assert view.notes.sentences() == ()
-    list(view.stream.messages(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
-    assert len(view.notes.sentences()) == 1
-
-
-def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexes(
-    tmp_path: Path,
-) -> None:
-    pauses = [odom(T0 + n * S // 100 + n // 100 * 2 * S, 0.0, 0.0) for n in range(500)]
-    late = [odom(T0 + (n - n % 7 // 5 * 9) * S // 100, 0.0, 0.0) for n in range(20, 500)]
-    for name, messages in (("pauses", pauses), ("late", late)):
-        path = tmp_path / f"{name}.mcap"
-        write_mcap(path, messages, McapLayout(chunk_size=10_000))
-        reader = McapReader()
-        for n in range(0, 500, 20):
-            reader.newest(path, "/odom", TimeWindow(T0, T0 + n * S // 50))
-        assert reader.summarize(path).notes == ()
-
-
 @pytest.mark.parametrize(
     "foreign",
     [
@@ -224,13 +193,6 @@ def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayo
     if not contradicted:
         assert found == expected
     assert bool(errors) == bool(others)
-
-
-def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
-    content = ReadChunks((), bytes(200), [100, 100])
-    messages = MessageTable(*np.array([[1], [0], [2**63 - 1], [1]]))
-    with pytest.raises(UnreadableError, match="a message is not where its index says"):
-        bulk.message_heads(content, messages)
 
 
 def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:

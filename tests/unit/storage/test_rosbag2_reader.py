@@ -14,25 +14,17 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from ros2_memory.core.errors import (
-    BagContradictionError,
-    BagError,
-)
+from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.scratch import Scratch
-from tests.support.bags import (
-    text,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import text, write_db3, write_mcap
 from tests.support.mcap_surgery import chatter
 from tests.support.memories import asked, memory_of
 from tests.unit.storage.test_mcap_reader import read, times
 
 EVERYTHING = TimeWindow.everything()
-STRING = "std_msgs/msg/String"
 UNPACKING = """\
 import sys
 from pathlib import Path
@@ -75,27 +67,6 @@ def compressed(path: Path, *, frames: int = 1) -> Path:
 
 def size_of(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
-def test_the_bag_of_2018_has_no_format_column_short_type_names_and_no_index(tmp_path: Path) -> None:
-    hello = text(0, "hello").payload.hex()
-    path = change(
-        tmp_path / "old.db3",
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL)",
-        "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
-        "timestamp INTEGER NOT NULL, data BLOB NOT NULL)",
-        "INSERT INTO topics VALUES (1, '/chatter', 'std_msgs/String')",
-        *(
-            f"INSERT INTO messages VALUES (NULL, 1, {at}, x'{hello}')"  # noqa: S608
-            for at in (3, 1, 2, 1)
-        ),
-    )
-    reader = Rosbag2Reader()
-    (topic,) = reader.summarize(path).topics
-    assert (topic.type, topic.encoding, topic.count, topic.latched) == (STRING, "cdr", 4, False)
-    records = read(reader, path)
-    assert times(records) == [1, 1, 2, 3]
-    assert getattr(reader.decode(records[0]), "data", "") == "hello"
 
 
 @pytest.mark.parametrize("asked_first", ["newest", "records", "summarize"])
@@ -243,16 +214,6 @@ def test_a_reading_may_end_while_its_thread_unpacks_another_file() -> None:
     thread.start()
     thread.join(20)
     assert not thread.is_alive()
-
-
-def test_temporary_files_go_with_the_reader(tmp_path: Path, scratch_root: Path) -> None:
-    path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))
-    reader = Rosbag2Reader()
-    assert len(read(reader, path)) == 3
-    assert list(scratch_root.iterdir())
-    del reader
-    gc.collect()
-    assert list(scratch_root.iterdir()) == []
 
 
 def test_what_a_killed_program_had_unpacked_is_deleted_by_the_next(

@@ -112,15 +112,6 @@ def test_metadata_attachments_and_the_profile_are_kept(tmp_path: Path) -> None:
     assert (message.sequence, message.log_time, message.publish_time) == (77, 5, 4)
 
 
-def test_a_file_of_the_targets_name_is_not_overwritten(tmp_path: Path) -> None:
-    source = write_mcap(tmp_path / "a.mcap", messages())
-    target = tmp_path / "b.mcap"
-    target.write_bytes(b"somebody's")
-    with pytest.raises(BagError, match="File exists"):
-        McapWriter().rewrite(source, target)
-    assert target.read_bytes() == b"somebody's"
-
-
 @needs_real
 def test_what_anybody_recorded_is_the_same_afterwards(tmp_path: Path) -> None:
     sources = [path for path in sorted(REAL.rglob("*.mcap")) if path.name != "Dockerfile.mcap"]
