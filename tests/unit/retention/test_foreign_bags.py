@@ -35,7 +35,6 @@ from tests.support.housekeepers import (
     in_moments,
     keeper_of,
     kept,
-    list_ended,
     own_all,
     recording,
     size_of,
@@ -115,21 +114,6 @@ class TestRetention:
         careful(bag_dir, max_bytes=counted - 1).apply()
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
-
-    def test_of_a_recording_that_was_noted_only_its_splits_go(self, tmp_path: Path) -> None:
-        mine = recording(tmp_path, A, 0)
-        own = list_ended(tmp_path, A)
-        for later in ("rec_later", "rec_latest"):  # without a heartbeat these may be being written
-            own.begin(later)
-        others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
-        newest = recording(tmp_path, B, 3 * 3600)
-        with capture_logs() as logs:
-            careful(tmp_path, max_bytes=LITTLE).apply()
-        assert [path.exists() for path in mine] == [False] * 5 + [True]
-        assert all(path.exists() for path in (*others, *newest))
-        [reported] = events(logs, "retention_applied")
-        assert reported["foreign_bytes"] == bytes_of([*others, *newest])
-        assert (tmp_path / A / "handover.json").exists()
 
     @settings(max_examples=examples(25), deadline=None)
     @given(

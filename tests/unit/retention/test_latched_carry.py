@@ -1,5 +1,3 @@
-import errno
-import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -112,20 +109,6 @@ def places(memory: Memory, moment: int, children: Iterable[str]) -> list[object]
 
 
 class TestTheBagOfCarriedMessages:
-    def test_the_newest_of_each_child_frame_is_carried_and_not_the_newest_message(
-        self, tmp_path: Path
-    ) -> None:
-        first = [frame(T0, "laser", 0.1), frame(T0 + 1, "camera", 0.2), frame(T0 + 2, "laser", 0.3)]
-        recording(tmp_path, "rec", [*first, *drive_in(0)], drive_in(1))
-        keep_only(tmp_path, "rec/rec_1.mcap")
-        assert files_in(tmp_path) == ["latched", "latched/carried.mcap", "rec", "rec/rec_1.mcap"]
-        assert OwnRecordings(tmp_path).owns_bag(tmp_path / "latched/carried.mcap")
-        assert carried_at(tmp_path) == [T0 + 1, T0 + 2]
-        assert places(memory_of(tmp_path), T0 + 15 * S, ["laser", "camera"]) == [
-            (0.3, 0.0, 0.0),
-            (0.2, 0.0, 0.0),
-        ]
-
     def test_a_carried_message_keeps_its_bytes_times_definition_and_qos(
         self, tmp_path: Path
     ) -> None:
@@ -140,17 +123,6 @@ class TestTheBagOfCarriedMessages:
         assert after.channel.latched
         assert replace(after.channel, metadata=metadata) == channel
         assert after._replace(channel=channel) == before
-
-    def test_it_is_not_written_again_where_nothing_changes(self, tmp_path: Path) -> None:
-        again = docked(T0, "home", received=T0 + 10 * S)
-        recording(tmp_path, "rec", [docked(T0, "home"), *drive(T0, T0 + 9 * S)])
-        recording(tmp_path, "sec", [again, *drive_in(1)])
-        recording(tmp_path, "thi", drive_in(2))
-        keep_only(tmp_path, "sec/sec_0.mcap", "thi/thi_0.mcap")
-        before = (tmp_path / "latched/carried.mcap").stat()
-        keep_only(tmp_path, "thi/thi_0.mcap")
-        after = (tmp_path / "latched/carried.mcap").stat()
-        assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
     def test_a_link_in_its_place_is_not_followed_and_nothing_is_lost(self, tmp_path: Path) -> None:
         bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
@@ -181,21 +153,6 @@ class TestTheBagOfCarriedMessages:
         assert files_in(tmp_path) == left
         keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
-
-    def test_its_grace_does_not_begin_with_a_carry_that_failed(self, tmp_path: Path) -> None:
-        at_home(tmp_path, splits=4)
-        size, now = (tmp_path / "rec/rec_0.mcap").stat().st_size, SettableClock(0)
-        keeper = keeper_of(
-            tmp_path, max_bytes=3 * size + 1, grace_s=60.0, monotonic=lambda: now.now() / S
-        )
-        with broken(McapWriter, "write"):
-            keeper.apply()
-        for number in (4, 5, 6):
-            write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", drive_in(number), LAYOUT)
-        now.at = 100 * S
-        keeper.apply()
-        assert carried_at(tmp_path) == [T0]
-        assert "rec/rec_0.mcap" in files_in(tmp_path)
 
     def test_after_a_kill_it_is_the_recorder_s_own(self, tmp_path: Path) -> None:
         at_home(tmp_path)
@@ -233,18 +190,6 @@ class TestTheBagOfCarriedMessages:
         now.at = 86_400 * S
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
-
-    def test_a_bag_stays_while_the_disk_does_not_tell_of_its_folder(self, tmp_path: Path) -> None:
-        at_home(tmp_path)
-        reader = BagDirReader(McapReader(), tmp_path)
-        keeper = keeper_of(tmp_path, measure_free=lambda _: 0, reader=reader)
-        keeper.apply()
-        folder = str(tmp_path / "rec")
-        with broken(os, "lstat", errno.EIO, where=lambda path: path == folder):
-            keeper.make_room(1)
-        assert (tmp_path / "rec" / "rec_0.mcap").exists()
-        keeper.make_room(1)
-        assert carried_at(tmp_path) == [T0]
 
     def test_what_lies_behind_a_damaged_part_of_a_bag_is_carried(self, tmp_path: Path) -> None:
         recording(tmp_path, "rec", (), drive_in(1))
@@ -315,7 +260,7 @@ class TestAnswers:
     @pytest.mark.parametrize(("gone", "since"), [(1, 51), (3, 151), (5, 256)])
     def test_they_are_the_same_after_as_before(self, bag_dir: Path, gone: int, since: int) -> None:
         memory = memory_of(bag_dir)
-        moments = [T0 + second * S for second in range(since, 300, 7)]
+        moments = [T0 + second * S for second in range(since, 300, 11)]
         frames = ["laser", "camera", "arm"]
 
         def answers() -> list[object]:

@@ -51,10 +51,7 @@ def bytes_of(bags: Iterable[StoredBag], *others: StoredFile) -> int:
 
 
 def contents(
-    *bags: StoredBag,
-    now: int = NOW,
-    other_bytes: int = 0,
-    free_bytes: int | None = None,
+    *bags: StoredBag, now: int = NOW, other_bytes: int = 0, free_bytes: int | None = None
 ) -> DirContents:
     return DirContents(bags, now, other_bytes, free_bytes, synchronised=True)
 
@@ -77,10 +74,6 @@ def hourly(hours: int, *, until: int = NOW) -> list[StoredBag]:
 
 
 class TestAge:
-    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
-        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
-        assert expired(contents(*before, after), LIMITS) == ()
-
     def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
         held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
@@ -94,29 +87,6 @@ class TestAge:
         hours = {each.end // HOUR for each in minutes if each.path.rpartition("/")[2] in going}
         rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
         assert {each.path for each in rest} <= held.needed
-
-    def test_simulated_time_ages_by_the_files_while_the_system_clock_is_right(self) -> None:
-        runs = [
-            bag(f"b{ago}", 60 * S, written=NOW - ago * DAY, recording=f"r{ago}") for ago in DAYS
-        ]
-        places = {f"r{ago}": -ago for ago in DAYS}
-        assert names(expired(contents(*runs), LIMITS)) == ["b9", "b8"]
-        listed = replace(contents(*runs), places=places)
-        assert names(expired(listed, LIMITS)) == ["b9", "b8"]
-        assert expired(replace(listed, synchronised=False), LIMITS) == ()
-
-    def test_in_whole_hours_a_clock_that_begins_anew_does_not_keep_old_runs(self) -> None:
-        held = replace(anew(2 * HOUR, 2), recorded_since={"r0": 200 * HOUR}, synchronised=False)
-        assert names(by_hours(held, LIMITS).to_delete) == ["r0_0", "r0_1", "r0_2", "r0_3"]
-
-    def test_a_future_date_has_no_newest_hour(self) -> None:
-        ahead = bag("ahead", NOW + 900 * DAY)
-        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
-        held = contents(*minutes, ahead)
-        assert "m0" not in names(by_hours(held, budget(200)).to_delete)
-
-
-DAYS = range(9, -1, -1)
 
 
 def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
@@ -141,12 +111,6 @@ class TestBudget:
             all_but_one = names(deletes(held, budget(0)))
             assert all_but_one == [f"r{n // 4}_{n % 4}" for n in range(11)]
 
-    def test_after_a_clock_that_was_ahead_its_bags_go_before_later_ones(self) -> None:
-        ahead = bag("ahead", NOW + 3 * DAY, recording="r0")
-        right = [bag(f"m{ago}", NOW - ago * 60 * S, recording="r1") for ago in (2, 1, 0)]
-        held = replace(contents(ahead, *right), places={"r0": 0, "r1": 1})
-        assert names(expired(held, budget(20))) == ["ahead", "m2"]
-
     def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
         bags = [
             bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
@@ -162,11 +126,6 @@ class TestBudget:
     def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order(self) -> None:
         last_hours = hourly(5, until=NOW + 10 * HOUR)
         assert names(expired(contents(*last_hours), budget(30))) == ["h4", "h3"]
-
-    def test_while_the_clock_is_not_set_what_it_dates_is_newest(self) -> None:
-        boot = [bag(f"boot{n}", n * 60 * S) for n in (1, 2)]
-        deleted = expired(contents(*hourly(3), *boot, now=200 * S), budget(20))
-        assert names(deleted) == ["h2", "h1", "h0"]
 
 
 def budget(size: int) -> RetentionLimits:

@@ -9,7 +9,6 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import RecordedTime
-from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.fakes import broken
 
 S = 10**9
@@ -63,22 +62,6 @@ def test_pauses_do_not_count_and_write_nothing(tmp_path: Path) -> None:
     assert time.since(["a"]) == {"a": 5 * S}
 
 
-def test_dates_of_a_recording_in_which_the_clock_was_set_stay_doubtful(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    for before, after in ((T0_S - 3600, T0_S), (T0_S, T0_S + 3600)):
-        time = RecordedTime(tmp_path)
-        end = recorded(time, "a", 20, lead_s=before)
-        time.confirm_clock()
-        end = recorded(time, "a", 20, since_s=end, lead_s=after)
-        end = recorded(time, "a", 20, since_s=end, lead_s=before)
-        time.confirm_clock()
-        end = recorded(time, "a", 20, since_s=end, lead_s=after)
-        assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset("a"), False)
-        time.confirm_clock()
-        recorded(time, "b", 20, since_s=end, lead_s=after)
-        assert RecordedTime(tmp_path).doubtful("ab") == {"a"}
-
-
 def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     assert RecordedTime(tmp_path).doubtful("ab") == frozenset()
@@ -111,16 +94,3 @@ def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(tmp_path: 
         found = each.since("abc")
         assert found["a"] == pytest.approx(300 * S, abs=60 * S)
         assert found["b"] == pytest.approx(100 * S, abs=60 * S)
-
-
-@needs_mounts
-def test_a_full_disk_is_reported_once_and_got_over(tmp_path: Path) -> None:
-    with small_disk(tmp_path / "disk", "1m") as disk:
-        folders(disk, "a", "b")
-        time = RecordedTime(disk)
-        with capture_logs() as captured:
-            with filled(disk):
-                end = recorded(time, "a", 200)
-            recorded(time, "b", 100, since_s=end)
-        assert [each["event"] for each in captured] == ["recorded_time_not_kept"]
-        assert RecordedTime(disk).since(["a"])["a"] == pytest.approx(100 * S, abs=60 * S)

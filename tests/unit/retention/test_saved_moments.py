@@ -72,24 +72,6 @@ class TestKeeping:
         assert (reported["complete"], reported["missing"]) == (False, missing)
         assert len(in_moments(tmp_path)) == 1
 
-    def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        recording(tmp_path, A, 0)
-        sidecar = tmp_path / A / "handover.json"
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25)
-        samefile = type(sidecar).samefile
-
-        def gone(path: Path, other: Path) -> bool:
-            sidecar.unlink(missing_ok=True)
-            return samefile(path, other)
-
-        monkeypatch.setattr(type(sidecar), "samefile", gone)
-        with capture_logs() as logs:
-            house._moments.relink_sidecars()
-        assert not events(logs, "moment_not_followed")
-
     def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(
         self, tmp_path: Path
     ) -> None:
@@ -108,17 +90,6 @@ class TestKeeping:
         assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
         assert "retention.max_moments_gb" in refusal(25, 35)
         assert len(list(stored_moments_in(tmp_path))) == 2
-
-    def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, A, 0)
-        house, moments = house_of(tmp_path), tmp_path / "moments"
-        with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
-            outcome = kept(house, tmp_path, 15, 25)
-        assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
-        assert not list(stored_moments_in(tmp_path))
-        assert lines(tmp_path) == []
 
     def test_a_request_is_not_granted_twice(self, tmp_path: Path) -> None:
         """As where the recorder was killed after it kept a moment, and before it answered."""
