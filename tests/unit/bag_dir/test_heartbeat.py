@@ -108,12 +108,7 @@ def test_any_json_is_read_without_a_crash(
 
 @pytest.mark.parametrize(
     ("interval_s", "away_s", "live"),
-    [
-        (2.0, 15, True),
-        (2.0, -15.001, False),
-        (10.0, 30, True),
-        (10.0, 30.001, False),
-    ],
+    [(2.0, 15, True), (2.0, -15.001, False), (10.0, 30, True), (10.0, 30.001, False)],
 )
 def test_it_is_live_for_three_intervals_and_at_least_15_s_on_either_side(
     interval_s: float, away_s: float, live: bool

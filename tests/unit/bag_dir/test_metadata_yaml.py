@@ -1,22 +1,14 @@
 """metadata.yaml after files of its recording were deleted."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import yaml
 from rosbags.rosbag2 import Reader
 
-from ros2_memory.bag_dir.metadata_yaml import (
-    Contents,
-    Listing,
-    correct,
-    describing,
-    parse_listing,
-)
+from ros2_memory.bag_dir.metadata_yaml import Listing, correct, parse_listing
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.housekeepers import bag, described
@@ -79,17 +71,3 @@ def test_a_long_one_is_corrected(tmp_path: Path) -> None:
     last.unlink()
     assert correct(tmp_path / "r", McapReader())
     assert parse_listing(path.read_text()).messages == {"r_0.mcap": 10}
-
-
-def test_a_qos_is_parsed_once_however_many_files_have_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, reader = bag(tmp_path / "r_0.mcap", 0), McapReader()
-    qos = (("offered_qos_profiles", "- reliability: reliable\n"),)
-    channels = [replace(channel, metadata=qos) for channel in reader.channels(path)]
-    contents = Contents(reader.summarize(path), channels)
-    text = describing("", {path.name: contents})
-    parse = Mock(wraps=yaml.load)
-    monkeypatch.setattr(yaml, "load", parse)
-    describing(text, {f"r_{number}.mcap": contents for number in range(20)})
-    assert parse.call_count == 2

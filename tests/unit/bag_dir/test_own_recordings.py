@@ -3,7 +3,6 @@
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.fakes import broken, failing
+from tests.support.fakes import broken
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import embedding, lines, own_all
 from tests.support.log_lines import with_checks
@@ -147,29 +146,6 @@ class TestWhatAKillLeaves:
         with capture_logs() as logs:
             assert not OwnRecordings(tmp_path).names()
         assert events(logs, "recordings_list_damaged")
-
-    def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
-        own = claimed(tmp_path)
-        own.begin(A)
-        (tmp_path / "old").mkdir()
-        old = identity_of(tmp_path / "old")
-        assert old
-        locked = OwnRecordings._locked
-
-        def adopting_first(self: OwnRecordings) -> AbstractContextManager[int | None]:
-            if self is own:  # another program has the lock, so this one waits
-                OwnRecordings(tmp_path).adopt({"old": old})
-                patch.setattr(own_recordings, "write_durably", failing())
-            return locked(self)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(OwnRecordings, "_locked", adopting_first)
-            with pytest.raises(RecorderError, match="No space left"):
-                own.begin(B)
-        assert own.owns(tmp_path / "old")
 
     def test_a_recording_that_is_about_to_begin_stays_listed_when_the_list_is_written_again(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

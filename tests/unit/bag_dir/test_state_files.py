@@ -3,6 +3,7 @@
 They are given as an installed robot has them on its disk, so their formats are tested, too.
 """
 
+import errno
 import os
 import re
 import stat
@@ -16,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir import state_files
+from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
 from ros2_memory.bag_dir.own_recordings import LIST
 from ros2_memory.bag_dir.state_files import (
@@ -118,6 +120,18 @@ def replace(file: Log | Document, bag_dir: Path, value: Any) -> None:
     (file.replace if isinstance(file, JsonLog) else file.write)(bag_dir, value)
 
 
+@pytest.fixture
+def flushed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of what is flushed from now on."""
+    names: list[str] = []
+
+    def fsync(descriptor: int) -> None:
+        names.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    return names
+
+
 @pytest.mark.parametrize(("file", "text"), [*LOGS, *DOCUMENTS], ids=name_of)
 class TestEveryFile:
     def test_it_is_written_as_it_stands_on_robots(
@@ -131,15 +145,10 @@ class TestEveryFile:
         assert path.read_text() == text
 
     def test_it_is_on_the_disk_before_it_gets_its_name_and_stands_where_the_disk_is_full(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: Log | Document, text: str
+        self, tmp_path: Path, flushed: list[str], file: Log | Document, text: str
     ) -> None:
         path = laid(tmp_path, file, text)
-        value, flushed = read(file, tmp_path), list[str]()
-
-        def fsync(descriptor: int) -> None:
-            flushed.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
-
-        monkeypatch.setattr(os, "fsync", fsync)
+        value = read(file, tmp_path)
         replace(file, tmp_path, value)
         written = path.read_text()
         assert flushed == [f".{path.name}.tmp", ".episodic"]
@@ -402,3 +411,21 @@ class TestForgotten:
         laid(tmp_path, FORGOTTEN, "".join(f"{each}\n" for each in lines))
         with pytest.raises(ValueError, match=f"line {at + 1}: {told}"):
             read_forgettings(tmp_path)
+
+
+def test_closed_splits_are_flushed_and_then_the_directory_that_names_them(
+    tmp_path: Path, flushed: list[str]
+) -> None:
+    (tmp_path / "a.mcap").touch()
+    (tmp_path / "b.mcap").touch()
+    assert flush_bags(tmp_path, ["a.mcap", "b.mcap", "gone.mcap"]) == []
+    assert flushed == ["a.mcap", "b.mcap", tmp_path.name]
+
+
+def test_what_cannot_be_flushed_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").touch()
+    with broken(os, "fsync", errno.EIO):
+        faults = flush_bags(tmp_path, ["a.mcap"])
+    assert len(faults) == 2
+    assert faults[0].startswith(str(tmp_path / "a.mcap"))
+    assert "power cut" in faults[0]
