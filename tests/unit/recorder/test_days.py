@@ -1,6 +1,5 @@
 """The folder `memory/`: what stays of bags that retention deletes."""
 
-import errno
 import json
 import operator
 import shutil
@@ -25,7 +24,6 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, THINNED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
-    SUPERSEDED,
     THINNED,
     Thinned,
     read_superseded,
@@ -262,17 +260,6 @@ def test_days_of_a_wrong_date_do_not_age_nor_any_by_an_unsure_clock(bag_dir: Pat
     assert days_in(bag_dir) == both[:1]
 
 
-def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(bag_dir: Path) -> None:
-    days = days_of(bag_dir)
-    for name, second in (("rec_A", 0), ("rec_B", 7200)):
-        split(bag_dir, second, name=name)
-    keep_all(bag_dir, days=days)
-    with broken(SUPERSEDED, "read", errno.EMFILE), pytest.raises(OSError, match="Too many"):
-        keep_all(bag_dir, "rec_B", days=days)
-    keep_all(bag_dir, "rec_B", days=days)
-    assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
-
-
 def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(bag_dir: Path) -> None:
     (bag_dir / "memory").mkdir()
     (bag_dir / DAY_FILE).write_bytes(b"\x89MCAP0\r\nbroken")
@@ -422,19 +409,6 @@ def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
     assert not bags_left(bag_dir)
 
 
-@pytest.mark.parametrize("after", [0, 50])
-def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
-    split(bag_dir, 0)
-    keep_all(bag_dir)
-    before = (bag_dir / DAY_FILE).read_bytes()
-    split(bag_dir, 60, name="rec_B")
-    with pytest.raises(BagError):
-        keep_all(bag_dir, "rec_B", writer=Failing(after))
-    assert (bag_dir / DAY_FILE).read_bytes() == before
-    left = sorted(path.name for path in (bag_dir / "memory").iterdir())
-    assert left == ["20260921.thinned.mcap", "thinned.json"]
-
-
 def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
     bag_dir: Path,
 ) -> None:
@@ -519,17 +493,17 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
 def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
     bag_dir: Path,
 ) -> None:
-    splits(bag_dir, range(10))
+    splits(bag_dir, range(5))
     split(bag_dir, 7200, name="rec_B")
     own_all(bag_dir)
     memory = days_of(bag_dir, writer=(writer := McapWriter()))
-    at_first = broken(writer, "write", where=lambda *_: bags_left(bag_dir, "rec_*") == 11)
+    at_first = broken(writer, "write", where=lambda *_: bags_left(bag_dir, "rec_*") == 6)
     with at_first, capture_logs() as logs:
         house(bag_dir, T0 + 7300 * S, max_bytes=1, memory=memory).apply()
-    assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [2]
+    assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [1]
     assert bags_left(bag_dir, "rec_*") == 1
     assert {int(one.log_time - T0) // (60 * S) for one in messages_in(bag_dir / DAY_FILE)} == {
-        *range(2, 10)
+        *range(1, 5)
     }
 
 
@@ -847,8 +821,7 @@ def test_where_a_day_cannot_be_written_the_limits_take_the_oldest_and_age_waits_
         assert left == {f"rec_A_{minute}.mcap" for minute in range(first, 80, 10)}
 
 
-@pytest.mark.parametrize("way", ["records", "batches"])
-@pytest.mark.parametrize("is_lasting", [False, True])
+@pytest.mark.parametrize(("way", "is_lasting"), [("records", True), ("batches", False)])
 def test_what_the_disk_does_not_give_holds_others_for_two_days_and_stays_if_it_comes(
     bag_dir: Path, way: str, is_lasting: bool
 ) -> None:

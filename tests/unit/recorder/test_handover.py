@@ -6,7 +6,6 @@ What either of them holds counts, and once.
 import itertools
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -136,6 +135,9 @@ def assert_union(bag_dir: Path) -> None:
         summary, everything = reader.summarize(path), TimeWindow.everything()
         forward = list(reader.records(path, TOPICS, everything))
         assert summary.count == len(forward)
+        for each in summary.topics:
+            times = [one.log_time for one in forward if one.channel.topic == each.topic]
+            assert (each.count, each.first, each.last) == (len(times), times[0], times[-1])
         assert list(reader.records(path, TOPICS, everything, newest_first=True)) == forward[::-1]
         for topic in TOPICS:
             of_topic = [each for each in forward if each.channel.topic == topic]
@@ -265,19 +267,6 @@ def test_without_stalls_the_cut_counts_each_once_and_nothing_is_listed(
     assert_union(bag_dir)
 
 
-def test_none_is_settled_while_a_file_that_may_hold_the_messages_is_written(tmp_path: Path) -> None:
-    published = publications(30)
-    old, new = tmp_path / "a", tmp_path / "b"
-    Recorder(0, 7.5, splits=(6.0,)).writes(old, published)
-    Recorder(4, 9, (Stall(6, 1),), splits=(8.0,)).writes(new, published)
-    hand_over(tmp_path, 5)
-    assert not settle_handover(old, new, READER, running={"a", "b"})
-    assert not settle_handover(old, new, READER, running={"b"})
-    write_mcap(new / "b_2.mcap", Recorder(9, 14).receives(published), LAYOUT)
-    assert settle_handover(old, new, READER, running={"b"})
-    assert_union(tmp_path)
-
-
 @pytest.mark.parametrize("published_at", ["log", "zero"])
 def test_without_publish_times_the_cut_stays_and_a_note_says_so(
     tmp_path: Path, published_at: str
@@ -382,19 +371,6 @@ def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path
         World(tmp_path).started(100)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
     assert read_handover(tmp_path / "c").handover.next is None
-
-
-def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: Path) -> None:
-    first = cut_recording(tmp_path, "a", 0, 10, delay=5)
-    second = cut_recording(tmp_path, "b", 8, 20, delay=9)
-    third = cut_recording(tmp_path, "c", 18, 25, delay=2)
-    write_handover(first, announcing_sidecar(Handover(), "b"))
-    end = Overlap(T0 + 18 * S, None, ("b_0.mcap",))
-    handed_over = replace(pending_sidecar("a"), next="c", counts_until=T0 + 19 * S, end=end)
-    write_handover(second, handed_over)
-    begin = Overlap(T0 + 17 * S, T0 + 21 * S, ("c_0.mcap",))
-    write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
-    assert counted(tmp_path) == once(range(250))
 
 
 def test_one_whose_predecessor_is_gone_counts_and_stays_as_it_is(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 import errno
-import os
 import threading
-from collections.abc import Iterable, MutableMapping
+from collections.abc import MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,11 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import (
     DELETED,
-    Loss,
     Receipt,
-    append_losses,
     append_receipts,
     read_losses,
 )
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.recorder import housekeeping
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
@@ -68,21 +64,6 @@ def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
 
 
 class TestRetention:
-    def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(
-        self, tmp_path: Path
-    ) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        left_open(tmp_path / "b" / "b_0.mcap", 100)
-        for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
-            (tmp_path / name).parent.mkdir()
-            (tmp_path / name).write_bytes(bytes(5000))
-        recording_now(tmp_path, "b")
-        total = size_of(tmp_path)
-        keeper_of(tmp_path, max_bytes=total).apply()
-        assert first.exists()
-        keeper_of(tmp_path, max_bytes=total - 1).apply()
-        assert not first.exists()
-
     @pytest.mark.parametrize("link", [".ros_log", "moments/x"])
     def test_the_budget_counts_nothing_behind_a_link(self, tmp_path: Path, link: str) -> None:
         bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
@@ -94,12 +75,6 @@ class TestRetention:
         (bags / link).symlink_to(elsewhere)
         keeper_of(bags, max_bytes=total).apply()
         assert first.exists()
-
-    def test_a_bag_dated_after_2262_stops_no_deletion(self, tmp_path: Path) -> None:
-        first, second, *_ = recording(tmp_path, "a", 0)
-        os.utime(second, ns=(T0, 10_413_792_000 * S))
-        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 1).apply()
-        assert not first.exists()
 
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
@@ -262,22 +237,6 @@ class TestDeletionsThatFail:
         assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
 
 
-class TestMakingRoom:
-    def test_where_no_deletion_is_enough_nothing_is_deleted_and_that_is_said_once(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, "a", 0)
-        before = files_in(tmp_path)
-        keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
-        with capture_logs() as logs:
-            keeper.make_room(PLENTY)
-            keeper.make_room(PLENTY)
-        assert files_in(tmp_path) == before
-        (told,) = events(logs, "room_out_of_reach")
-        assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
-        assert not events(logs, "budget_not_held")
-
-
 class TestInTheBackground:
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
@@ -365,35 +324,6 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     keeper.apply()
     keeper.wait()
     assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found
-
-
-def test_an_interruption_that_comes_while_another_is_written_is_written_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keeper = keeper_of(tmp_path, clock=later(0))
-    paused = threading.Thread(target=keeper.note_restart, args=(T0, "paused"))
-    lock, waits = threading.Lock(), threading.Event()
-
-    class WatchedLock:
-        def __enter__(self) -> None:
-            if threading.current_thread() is paused:
-                waits.set()
-            lock.acquire()
-
-        def __exit__(self, *_: object) -> None:
-            lock.release()
-
-    def slow(bag_dir: Path, losses: Iterable[Loss]) -> None:
-        append_losses(bag_dir, losses)
-        if not paused.ident:
-            paused.start()
-            assert waits.wait(60)
-
-    monkeypatch.setattr(keeper, "_lock", WatchedLock())
-    monkeypatch.setattr(housekeeping, "append_losses", slow)
-    keeper.note_restart(T0, "died")
-    paused.join()
-    assert [loss.by for loss in read_losses(tmp_path, 0, MAX_NS)] == ["died", "paused"]
 
 
 def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:

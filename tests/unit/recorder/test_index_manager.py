@@ -7,9 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from structlog.testing import capture_logs
 
-from ros2_memory.core.model import BagFile, BagState, SetAside
+from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
@@ -51,30 +50,6 @@ def _names(files: Iterable[BagFile | SetAside]) -> list[str]:
     return [each.path.name for each in files]
 
 
-def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9], silent=["/scan", "/lost"])
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [10, 19], topic="/scan")
-    plain(yard.bag_dir / "rec" / "rec_2.mcap", silent=["/idle"])
-    plain(yard.bag_dir / "rec" / "rec_3.mcap", [30], closed=False)
-    (yard.bag_dir / "rec" / "rec_4.mcap").touch()
-    plain(yard.bag_dir / "old" / "old_0.db3", [1])
-    (yard.bag_dir / "latest").symlink_to(yard.bag_dir / "rec", target_is_directory=True)
-    yard.age()
-    plain(yard.bag_dir / "rec" / "rec_5.mcap", [40], closed=False)
-    os.utime(yard.bag_dir / "rec" / "rec_5.mcap", ns=(NOW, NOW))
-    snapshot = yard.index.refresh()
-    assert [(bag.path.name, bag.state) for bag in snapshot.bags] == [
-        ("rec_0.mcap", BagState.CLOSED),
-        ("rec_1.mcap", BagState.CLOSED),
-        ("rec_3.mcap", BagState.INCOMPLETE),
-    ]
-    assert _names(snapshot.active) == ["rec_5.mcap"]
-    assert _names(snapshot.damaged) == ["rec_4.mcap"]
-    assert _names(snapshot.unread) == ["latest", "old_0.db3"]
-    assert [path.name for path in snapshot.empty] == ["rec_2.mcap"]
-    assert snapshot.silent_topics == {"/lost", "/idle"}
-
-
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
     for split in range(3):
         plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
@@ -90,11 +65,7 @@ def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
 
 @pytest.mark.parametrize(
     ("plain_closed", "packed_closed", "answers"),
-    [
-        (True, False, "rec_0.mcap"),
-        (False, True, "rec_0.mcap.zstd"),
-        (False, False, "rec_0.mcap"),
-    ],
+    [(True, False, "rec_0.mcap"), (False, True, "rec_0.mcap.zstd"), (False, False, "rec_0.mcap")],
 )
 def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     tmp_path: Path, plain_closed: bool, packed_closed: bool, answers: str
@@ -106,20 +77,6 @@ def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     snapshot = yard.index.refresh()
     assert _names(snapshot.bags) == [answers]
     assert snapshot.active == snapshot.damaged == snapshot.unread == ()
-
-
-def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
-    tmp_path: Path,
-) -> None:
-    yard = Yard(tmp_path, ".mcap")
-    plain(tmp_path / "rec_0.mcap", [1])
-    plain(tmp_path / "rec_1.mcap.zstd", [1])
-    yard.age()
-    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
-    snapshot = yard.scan_after()
-    assert _names(snapshot.bags) == ["rec_0.mcap"]
-    assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]
-    assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
 
 
 def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:
@@ -172,17 +129,3 @@ def test_a_scan_that_fails_on_a_defect_loses_nothing(yard: Yard) -> None:
         yard.index.snapshot()
     yard.reader.before_summary = bool
     assert len(yard.index.snapshot().bags) == 3
-
-
-def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
-    (yard.bag_dir / "rec" / "rec_1.mcap").touch()
-    yard.age()
-    with capture_logs() as events:
-        yard.scan_after()
-        yard.scan_after(5)
-    damaged, scanned = events
-    assert damaged["event"] == "bag_damaged"
-    assert (damaged["reason"], Path(damaged["path"]).name) == ("the file is empty", "rec_1.mcap")
-    counts = [scanned[key] for key in ("event", "bags", "added", "removed", "damaged", "active")]
-    assert counts == ["index_scanned", 1, 1, 0, 1, 0]

@@ -13,12 +13,7 @@ from ros2_memory.bag_dir.state_files import Loss, read_losses
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.recorder import measure
 from ros2_memory.recorder import reception as reception_module
-from ros2_memory.recorder.measure import (
-    OfferedQos,
-    TopicFlow,
-    measure_split,
-    offered_by_all,
-)
+from ros2_memory.recorder.measure import OfferedQos, TopicFlow, measure_split, offered_by_all
 from ros2_memory.recorder.reception import (
     ASK_AGAIN_S,
     ASKED_FOR,

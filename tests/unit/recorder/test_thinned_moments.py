@@ -13,15 +13,7 @@ from tests.support import housekeepers
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.memories import reply_over
-from tests.unit.recorder.test_days import (
-    DAY_FILE,
-    T0,
-    T0_S,
-    days_of,
-    house,
-    messages_in,
-    split,
-)
+from tests.unit.recorder.test_days import DAY_FILE, T0, T0_S, days_of, house, messages_in, split
 
 S = NS_PER_S
 NEWEST = T0 + 20 * 3600 * S

@@ -6,11 +6,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.process.command import (
-    STATISTICS,
-    options_in_help,
-    record_argv,
-)
+from ros2_memory.recorder.process.command import STATISTICS, options_in_help, record_argv
 from ros2_memory.recorder.process.topics import TopicSelection
 
 TOPICS = TopicSelection(("/odom", "/tf", "/tf_static"))
