@@ -31,8 +31,8 @@ STOP_ENDS_S: Final = 0.5
 """Of all stops in a window together: where noise hides when a robot began to move.
 
 A robot that leaves with 0.2 m/s, the slowest here, is clear of four standard deviations of noise,
-20 mm, after 0.1 s. Of all ends in 900 worlds one in a thousand was 0.13 s off, none 0.25 s. A minute
-has ten at most, of which some are early and some late.
+20 mm, after 0.1 s. Of all ends in 900 worlds one in a thousand was 0.13 s off, none 0.25 s. A
+minute has ten at most, of which some are early and some late.
 """
 COARSE: Final = 2e-4
 """Metres and units: replies round."""
