@@ -36,6 +36,14 @@ def test_a_holder_on_another_machine_counts_as_alive(tmp_path: Path) -> None:
     os.close(descriptor)
 
 
+def test_the_child_of_a_recorder_that_died_is_waited_for_and_then_named(tmp_path: Path) -> None:
+    # A process of the same number as ours that is not ours: a container that was started anew.
+    holder = {"pid": os.getpid(), "host": socket.gethostname()}
+    descriptor = held_by(tmp_path, json.dumps(holder))
+    assert "ros2 bag record of its that still runs" in refusal(tmp_path)
+    os.close(descriptor)
+
+
 def test_a_directory_that_cannot_be_written_into_is_refused_with_its_key(tmp_path: Path) -> None:
     assert "recording.bag_dir" in refusal(tmp_path / "nowhere")
 

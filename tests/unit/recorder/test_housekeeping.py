@@ -237,6 +237,22 @@ class TestDeletionsThatFail:
         assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
 
 
+class TestMakingRoom:
+    def test_where_no_deletion_is_enough_nothing_is_deleted_and_that_is_said_once(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, "a", 0)
+        before = files_in(tmp_path)
+        keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
+        with capture_logs() as logs:
+            keeper.make_room(PLENTY)
+            keeper.make_room(PLENTY)
+        assert files_in(tmp_path) == before
+        (told,) = events(logs, "room_out_of_reach")
+        assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
+        assert not events(logs, "budget_not_held")
+
+
 class TestInTheBackground:
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from structlog.testing import capture_logs
 
 from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.index.snapshot import Snapshot
@@ -65,7 +66,11 @@ def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
 
 @pytest.mark.parametrize(
     ("plain_closed", "packed_closed", "answers"),
-    [(True, False, "rec_0.mcap"), (False, True, "rec_0.mcap.zstd"), (False, False, "rec_0.mcap")],
+    [
+        (True, False, "rec_0.mcap"),
+        (False, True, "rec_0.mcap.zstd"),
+        (False, False, "rec_0.mcap"),
+    ],
 )
 def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     tmp_path: Path, plain_closed: bool, packed_closed: bool, answers: str
@@ -77,6 +82,20 @@ def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     snapshot = yard.index.refresh()
     assert _names(snapshot.bags) == [answers]
     assert snapshot.active == snapshot.damaged == snapshot.unread == ()
+
+
+def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
+    tmp_path: Path,
+) -> None:
+    yard = Yard(tmp_path, ".mcap")
+    plain(tmp_path / "rec_0.mcap", [1])
+    plain(tmp_path / "rec_1.mcap.zstd", [1])
+    yard.age()
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == ["rec_0.mcap"]
+    assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]
+    assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
 
 
 def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:
@@ -129,3 +148,17 @@ def test_a_scan_that_fails_on_a_defect_loses_nothing(yard: Yard) -> None:
         yard.index.snapshot()
     yard.reader.before_summary = bool
     assert len(yard.index.snapshot().bags) == 3
+
+
+def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    (yard.bag_dir / "rec" / "rec_1.mcap").touch()
+    yard.age()
+    with capture_logs() as events:
+        yard.scan_after()
+        yard.scan_after(5)
+    damaged, scanned = events
+    assert damaged["event"] == "bag_damaged"
+    assert (damaged["reason"], Path(damaged["path"]).name) == ("the file is empty", "rec_1.mcap")
+    counts = [scanned[key] for key in ("event", "bags", "added", "removed", "damaged", "active")]
+    assert counts == ["index_scanned", 1, 1, 0, 1, 0]

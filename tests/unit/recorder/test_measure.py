@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.timebase import NS_PER_HOUR
 from ros2_memory.recorder.measure import (
     Arrival,
     Arrivals,
@@ -81,6 +82,17 @@ def test_nothing_is_expected_of_what_has_no_cadence() -> None:
     two_publishers = [tick for first in range(50) for tick in (first, first + 20)]
     for ticks in (irregular, [0, 1, 3], two_publishers):
         assert holes(at(ticks), "stamps") is None
+
+
+def test_a_hole_between_two_splits_counts_and_only_once() -> None:
+    counter = LossCounter()
+    assert counter.add_split("a", progress([*range(100)])) == []
+    [loss] = counter.add_split("a", progress([*range(103, 200)]))
+    assert counter.add_split("a", progress([*range(200, 300)])) == []
+    found = (loss.topic, loss.start, loss.lost, loss.by)
+    assert found == ("/odom", T0 + 99 * PERIOD + 1000, 3, "stamps")
+    assert counter.in_last_hour(loss.stop) == {"/odom": 3}
+    assert counter.in_last_hour(loss.stop + NS_PER_HOUR) == {}
 
 
 @given(order=st.permutations(["old", "old", "old", "new", "new", "new"]), taken=st.booleans())

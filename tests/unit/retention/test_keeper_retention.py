@@ -16,11 +16,34 @@ from ros2_memory.history.view import AtTime
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
-from tests.support.housekeepers import NOW, T0, A, B, S, bag, house_of, kept, recording, size_of
+from tests.support.housekeepers import (
+    NOW,
+    T0,
+    A,
+    B,
+    S,
+    bag,
+    house_of,
+    kept,
+    list_ended,
+    recording,
+    size_of,
+)
 from tests.support.memories import memory_of
 
 
 class TestRetention:
+    @pytest.mark.parametrize("behind_h", [169, 300])
+    def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
+        made = []
+        for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
+            made.append(bag(tmp_path / name / f"{name}_0.mcap", hours * 3600))
+            list_ended(tmp_path, name)
+        house_of(tmp_path, max_age_h=168, keeps_foreign=True).apply()
+        assert all(path.exists() for path in made)
+        house_of(tmp_path, max_bytes=size_of(tmp_path) * 6 // 10, keeps_foreign=True).apply()
+        assert [path.exists() for path in made] == [False, False, True, True]
+
     def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
         self, tmp_path: Path
     ) -> None:

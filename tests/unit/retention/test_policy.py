@@ -51,7 +51,10 @@ def bytes_of(bags: Iterable[StoredBag], *others: StoredFile) -> int:
 
 
 def contents(
-    *bags: StoredBag, now: int = NOW, other_bytes: int = 0, free_bytes: int | None = None
+    *bags: StoredBag,
+    now: int = NOW,
+    other_bytes: int = 0,
+    free_bytes: int | None = None,
 ) -> DirContents:
     return DirContents(bags, now, other_bytes, free_bytes, synchronised=True)
 
@@ -87,6 +90,12 @@ class TestAge:
         hours = {each.end // HOUR for each in minutes if each.path.rpartition("/")[2] in going}
         rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
         assert {each.path for each in rest} <= held.needed
+
+    def test_a_future_date_has_no_newest_hour(self) -> None:
+        ahead = bag("ahead", NOW + 900 * DAY)
+        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
+        held = contents(*minutes, ahead)
+        assert "m0" not in names(by_hours(held, budget(200)).to_delete)
 
 
 def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
