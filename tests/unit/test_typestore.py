@@ -186,16 +186,6 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
     def test_a_service_under_another_name_is_refused(self, name: str) -> None:
         assert "a service definition" in reason(lookup(name, "bool ask\n---\nbool answer\n"))
 
-    def test_a_type_without_fields_differs_from_one_whose_text_was_not_found(self) -> None:
-        empty = lookup("a_msgs/msg/Nothing", "")
-        assert isinstance(empty, MessageType)
-        assert not empty.fields.fields
-        assert decoded(empty, CDR + b"\0") is not None
-        standard = lookup("std_msgs/msg/String", "")
-        assert isinstance(standard, MessageType)
-        assert standard.fields.fields
-        assert reason(lookup("a_msgs/msg/Nothing", "", ""))
-
 
 def nested(depth: int) -> str:
     """A definition of so many types, each in the one before it."""

@@ -58,14 +58,6 @@ def test_a_moment_has_its_local_time_and_its_age_and_what_there_is_not_is_in_wor
     assert shown([]) == "none"
 
 
-def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
-    rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
-    output = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
-    assert output[:4] == ["duration_s", "2.1", "h", "total"]
-    assert shown({"yaw_rate_deg_s": 180.0, "speed_m_s": 130.0}).split()[1::2] == ["180", "130"]
-    assert output[-3:] == ["days", "/b", "12.25"]
-
-
 def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
     assert with_commands("the tools are: list_recorded_topics, visits").endswith(
         "list_recorded_topics, visits"

@@ -155,19 +155,6 @@ def released() -> Iterator[threading.Event]:
     event.set()
 
 
-def test_all_answer_in_their_order_and_what_they_cost_is_the_calls() -> None:
-    def work(robot: Robot, call: Call) -> str:
-        call.stages.add("read", 5)
-        call.used_active = robot.name == "r7"
-        return robot.name.upper()
-
-    call = Call()
-    found = FanOut().ask(robots(9), work, call)
-    assert [*found.items()] == [(f"r{number}", f"R{number}") for number in range(9)]
-    assert call.stages.spent == {"read": 45}
-    assert call.used_active
-
-
 def test_an_error_is_that_of_its_robot_and_a_fault_says_nothing_more() -> None:
     def work(robot: Robot, _call: Call) -> str:
         if robot.name == "r0":

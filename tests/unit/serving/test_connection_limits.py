@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any
 from unittest.mock import Mock
@@ -19,6 +19,7 @@ from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
 from ros2_memory.serving.connection_limits import MAX_BODY_BYTES, RequestLimits
+from ros2_memory.serving.dispatch import MAX_DEPTH, excess_in_arguments
 from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import (
     MCP_HEADERS,
@@ -351,6 +352,16 @@ async def test_a_fault_of_the_application_is_not_hidden() -> None:
 
     with pytest.RaisesGroup(anyio.BrokenResourceError):
         await client(RequestLimits(broken)).post("/messages/", content=b"{}")
+
+
+@pytest.mark.parametrize("wrap", [lambda inner: [inner], lambda inner: {"x": inner}])
+def test_depth_is_counted_exactly(wrap: Callable[[Any], Any]) -> None:
+    value: Any = 1
+    for _ in range(MAX_DEPTH - 1):
+        value = wrap(value)
+
+    assert excess_in_arguments({"a": value}) is None
+    assert excess_in_arguments({"a": wrap(value)}) is not None
 
 
 @pytest.mark.parametrize(("states_it", "taken"), [(True, 0), (False, 2)])

@@ -1,0 +1,50 @@
+"""Rows of arrays, and arrays gathered out of bytes."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.arrays import Columns, distinct_rows, gathered
+
+PAIR = np.dtype([("number", "<u2"), ("value", "<f8")])
+
+
+def test_nothing_is_gathered_behind_the_end() -> None:
+    last = np.array([2])
+    assert gathered(b"abcd", np.dtype("<u2"), last).tolist() == [struct.unpack("<H", b"cd")[0]]
+    with pytest.raises(IndexError):
+        gathered(b"abcd", np.dtype("<u2"), last + 1)
+    with pytest.raises(IndexError):
+        gathered(b"a", np.dtype("<u4"), np.array([0]))
+    assert gathered(b"", PAIR, np.empty(0, np.int64)).size == 0
+
+
+@given(st.lists(st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(-9, 300))))
+def test_columns_have_the_rows_of_their_table_in_fewer_bytes(rows: list[tuple[int, int]]) -> None:
+    table = np.array(rows, np.int64).reshape(-1, 2)
+    columns = Columns(table.T)
+    which = np.arange(len(rows))[::-2]
+
+    assert len(columns) == len(rows)
+    assert columns[which].tolist() == table[which].tolist()
+    assert columns[:, 0].tolist() == table[:, 0].tolist()
+    assert columns[which, 1].tolist() == table[which, 1].tolist()
+    assert columns.nbytes <= 10 * len(rows)
+
+
+@given(
+    st.lists(st.tuples(st.integers(-3, 3), st.integers(0, 4)), min_size=1),
+    st.sampled_from([1, 10**6, 10**12]),
+)
+def test_distinct_rows_are_those_in_order_however_many_there_may_be(
+    rows: list[tuple[int, int]], width: int
+) -> None:
+    """Few that there may be are looked up, many are sorted."""
+    table = np.array(rows, np.int64) * width
+    found, number = distinct_rows([*table.T])
+
+    assert found.tolist() == sorted(map(list, {*map(tuple, table.tolist())}))
+    assert found[number].tolist() == table.tolist()
