@@ -1,9 +1,11 @@
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from mcp import Client
 
+from ros2_memory import package_version
 from ros2_memory.bootstrap import (
     build_backfill,
     build_memory,
@@ -23,6 +25,16 @@ def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
     refused = settings(tmp_path, f"reader.custom_msg_paths=[{tmp_path}]")
     with pytest.raises(ConfigError, match=r"^reader\.custom_msg_paths: .* holds no"):
         build_reader(refused)
+
+
+async def test_the_server_is_built_as_configured(tmp_path: Path) -> None:
+    chosen = settings(tmp_path, "server.name=memory_two", "data.time_tolerance_s=0.7")
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        info, tools = client.server_info, (await client.list_tools()).tools
+    assert info is not None
+    assert (info.name, info.version) == ("memory_two", version("ros2-memory"))
+    assert info.version == package_version()
+    assert "default 0.7" in str([tool.description for tool in tools])
 
 
 def test_a_memory_stores_columns_unless_it_is_told_not_to(

@@ -108,21 +108,6 @@ def test_what_makes_no_sense_is_refused_with_the_reason(
     assert "\x1b" not in refused
 
 
-@pytest.mark.parametrize(
-    ("path", "bags", "poses"),
-    # The two loose files hold the same messages, and lie in one folder.
-    [(".", 5, 19), ("a", 2, 10), ("a/a_0.mcap", 1, 5), ("loose/red.mcap", 1, 2)],
-)
-def test_info_and_topics_take_a_folder_or_a_bag(
-    folder: Path, exits: Program, path: str, bags: int, poses: int
-) -> None:
-    shown = exits(0, f"info {path} --json").json
-    assert shown["data_time_range"]["bags"] == bags
-    assert shown["memory_status"]["recorder"] is None
-    counts = {row["topic"]: row["count"] for row in exits(0, f"topics {path} --json").json}
-    assert counts["/odom"] == poses
-
-
 def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
     folder: Path, exits: Program
 ) -> None:

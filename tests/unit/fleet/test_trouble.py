@@ -262,12 +262,3 @@ def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> Non
     )
     assert found["at_least"] == 12
     assert "total" not in found
-
-
-def test_a_stay_that_goes_on_is_the_newest() -> None:
-    replies = [
-        RobotReply(name, {"visits": [{"arrived": arrived, "departed": departed}], "total": 1})
-        for name, arrived, departed in (("r1", 8.0, 9.0), ("r2", 1.0, None))
-    ]
-    found = one_reply("visits", *replies)["visits"]
-    assert [row["robot_name"] for row in found] == ["r2", "r1"]

@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -16,6 +17,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
+from ros2_memory.core.model import Sample
 from ros2_memory.core.timebase import NS_PER_S, unix_rounded_up
 from ros2_memory.tools.replies import Replies
 
@@ -88,6 +90,25 @@ def test_topics_are_always_a_list_of_rows_of_five_keys_with_the_busiest_first(
     assert (rest["topic"], rest["type"]) == (f"({len(left_out)} more: use pattern)", "")
     assert rest["first_ts"] == unix_rounded_up(min(row.first for row in left_out))
     assert rest["last_ts"] == unix_rounded_up(max(row.last for row in left_out))
+
+
+def test_a_range_with_fields_is_a_table() -> None:
+    place: Any = {"x": 1.0, "y": 2.0, "z": 0.0}
+    samples = (
+        Sample(T0, {"position": place, "yaw": 1.25}),
+        Sample(T0 + 123_456_789, {"position": None, "yaw": 0.5}),
+    )
+    fields = ("position", "yaw")
+    found = results.TopicRange("/odom", "nav_msgs/msg/Odometry", 2, samples, fields=fields)
+    shown = json.loads(REPLIES.answer(found).text)
+    assert shown["fields"] == [
+        "timestamp", "position.x", "position.y", "position.z", "yaw", "position",
+    ]  # fmt: skip
+    assert shown["rows"] == [
+        [1784023200.0, 1.0, 2.0, 0.0, 1.25, None],
+        [1784023200.123457, None, None, None, 0.5, None],
+    ]
+    assert "samples" not in shown
 
 
 def test_an_error_stays_below_the_cap() -> None:

@@ -12,7 +12,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import _listed_tool
 from ros2_memory.tools import extra_tools, spec_tools
-from ros2_memory.tools.arguments import At, LastMatchArguments, MotionArguments
+from ros2_memory.tools.arguments import At, MotionArguments
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature, Tool
 from ros2_memory.tools.instructions import instructions
@@ -223,9 +223,3 @@ def test_the_condition_type_must_be_a_known_one() -> None:
 def test_a_condition_value_must_be_something_finite(value: Any) -> None:
     reply = refusal("find_last_match", topic="/a", condition_type="equals", value=value)
     assert reply.startswith("value was ")
-
-
-def test_fields_may_be_one_name_a_list_or_its_json_text() -> None:
-    for fields in ("position", ["position"], '["position"]', ("position",)):
-        given = {"topic": "/a", "condition_type": "contains", "value": "x", "fields": fields}
-        assert dict(Signature(LastMatchArguments).parse(given))["fields"] == ("position",)

@@ -73,22 +73,6 @@ def utc(seconds: int, decimals: str = "") -> str:
     return f"{datetime.fromtimestamp(T0 + seconds, UTC):%Y-%m-%dT%H:%M:%S}{decimals}Z"
 
 
-def test_at_a_text_is_up_to_the_end_of_its_last_decimal(drive: Memory, tmp_path: Path) -> None:
-    def x_at(timestamp: object, **given: object) -> object:
-        return asked(drive, "get_position_at", timestamp=timestamp, **given).get("x")
-
-    assert [x_at(utc(5)), x_at(utc(5, ".0")), x_at(utc(5, ".0458"))] == [5.9, 5.0, 5.0]
-    assert [x_at(utc(5, ".045890")), x_at(T0 + 5), x_at(str(T0 + 5))] == [4.9, 4.9, 4.9]
-    several = asked(drive, "get_position_at", timestamps=[utc(5), T0 + 5])
-    assert [each["x"] for each in several["results"]] == [5.9, 4.9]
-    # The tolerance counts from the begin of the text.
-    assert x_at(utc(20), tolerance_s=0.06) == 19.9
-    assert x_at(utc(20), tolerance_s=0.05) is None
-    assert "tolerance_s of at least 0.055" in str(
-        asked(drive, "get_position_at", timestamp=utc(20), tolerance_s=0.05)
-    )
-
-
 def test_a_window_ends_where_its_end_begins_unless_it_starts_there(
     drive: Memory, tmp_path: Path
 ) -> None:
