@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 
@@ -68,6 +69,13 @@ def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
     output = exits(0, "watch --count 1").out
     assert "silent" not in output
     assert rows_of(output)["/bumper"].endswith("slow")
+
+
+def test_messages_that_two_recordings_have_count_once(bag_dir: Path, exits: Program) -> None:
+    shutil.copytree(bag_dir / "rec", bag_dir / "twin")
+    rows = exits(0, "watch --count 1 --json").json["topics"]
+    rates = {row["topic"]: (row["rate_hz"], row["usual_hz"]) for row in rows}
+    assert rates["/odom"] == pytest.approx((10, 10), rel=0.05)
 
 
 def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
