@@ -151,7 +151,7 @@ def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
 @pytest.mark.parametrize(("window", "reason"), NOTHING)
 @pytest.mark.parametrize("tool", WINDOWED)
 def test_a_window_without_recording_is_not_answered_as_never(
-    memory: Memory, bag_dir: Path, tool: str, window: tuple[int, int], reason: str
+    memory: Memory, tool: str, window: tuple[int, int], reason: str
 ) -> None:
     start, end = (T0_S + each for each in window)
     told = asked(memory, tool, **WINDOWED[tool], start=start, end=end)
@@ -160,7 +160,7 @@ def test_a_window_without_recording_is_not_answered_as_never(
 
 
 @pytest.mark.parametrize("tool", BEFORE)
-def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path, tool: str) -> None:
+def test_never_before_the_memory_began_is_no_data(memory: Memory, tool: str) -> None:
     told = asked(memory, tool, **BEFORE[tool], before=T0_S - 1)
     assert (told["error"], told["reason"]) == ("no_data", "outside_range")
     found = asked(memory, tool, **BEFORE[tool], before=T0_S + 90)
@@ -170,9 +170,7 @@ def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path,
 
 
 @pytest.mark.parametrize("tool", WINDOWED)
-def test_a_window_that_is_recorded_in_part_says_how_much(
-    memory: Memory, bag_dir: Path, tool: str
-) -> None:
+def test_a_window_that_is_recorded_in_part_says_how_much(memory: Memory, tool: str) -> None:
     told = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
     window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
     assert f"recorded only 48 of 149 s {window}" in told["notes"]

@@ -110,7 +110,7 @@ def write_splits(
 ) -> None:
     for nth, begin in enumerate(range(start, stop + 1, SPLIT)):
         inside = [
-            replace(said(log_time, text, was), log_time=log_time, publish_time=was)
+            replace(said(text, was), log_time=log_time, publish_time=was)
             for log_time, was, text in messages
             if begin <= log_time < begin + SPLIT
         ]
@@ -118,7 +118,7 @@ def write_splits(
         write_mcap(folder / f"{folder.name}_{nth}.mcap", [*inside, *poses], LAYOUT)
 
 
-def said(log_time: int, text: str, was: int) -> Msg:
+def said(text: str, was: int) -> Msg:
     return log_entry(was, 40 if text == "lost" else 20, "nav", text)
 
 
@@ -305,7 +305,7 @@ def sightings(recordings: Mapping[str, list[Msg]]) -> tuple[int, float]:
     return count, total / S
 
 
-def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
+def counted(memory: Memory) -> tuple[int, float]:
     """The same as `find_matches` counts it; both are 0 where there is no such topic."""
     reply = asked(memory, "find_matches", **CUP, by="day", **SPAN)
     values = dict(zip(reply.get("columns", ())[1:], reply.get("all", ()), strict=True))
@@ -334,7 +334,7 @@ def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
         recorded = asked(plain, "data_time_range")
         # Durations are without gaps, and pauses that look as where the clock was set ahead.
         if not has_types and not recorded["clock_steps"] and not recorded["gaps"]:
-            assert counted(plain, bag_dir) == pytest.approx(sightings(recordings), abs=0.051)
+            assert counted(plain) == pytest.approx(sightings(recordings), abs=0.051)
         for name, given_ in QUESTIONS:
             expected = asked(plain, name, **given_, **SPAN)
             stored = draw.choice(every)

@@ -32,7 +32,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     return memory_of(folder)
 
 
-def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path: Path) -> None:
+def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory) -> None:
     times = [T0 + 5, T0 + 14.5, T0 + 15.5, T0 + 25, T0 + 5000]
     told = asked(memory, "get_position_at", timestamps=times)
     first, hole, again, last, beyond = told["results"]
@@ -45,7 +45,7 @@ def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path:
     assert "detail" in beyond
 
 
-def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path: Path) -> None:
+def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory) -> None:
     for timestamps in ({"timestamps": [T0, T0 + 1]}, {"timestamp": T0}):
         told = asked(memory, "get_topic_at_time", topic="/nope", **timestamps)
         assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")

@@ -76,7 +76,7 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
         assert "clock steps" not in later["counts"]
 
 
-def steps(memory: Memory, folder: Path) -> list[Any]:
+def steps(memory: Memory) -> list[Any]:
     found: list[Any] = asked(memory, "data_time_range")["clock_steps"]
     return found
 
@@ -96,7 +96,7 @@ def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_pat
     write_mcap(tmp_path / "beside" / "beside_0.mcap", beside)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
     assert (BEGIN + 200) * S in [pause.end for pause in memory.index.snapshot().pauses]
-    assert steps(memory, tmp_path) == []
+    assert steps(memory) == []
 
 
 def late(t: float) -> float:
@@ -130,11 +130,10 @@ def test_what_only_looks_like_a_step_is_none(
 ) -> None:
     memory = memory_in(tmp_path)
     assert len(memory.index.snapshot().suspects) == suspects
-    assert steps(memory, tmp_path) == []
+    assert steps(memory) == []
 
 
-@pytest.mark.parametrize("queued", [3, 100])
-@pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
+@pytest.mark.parametrize(("when", "queued"), [(54.95, 3), (59.95, 100)])
 def test_what_queued_up_while_the_recorder_stalled_is_no_step(
     tmp_path: Path, when: float, queued: int
 ) -> None:
@@ -154,7 +153,7 @@ def test_what_queued_up_while_the_recorder_stalled_is_no_step(
     write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
     for each in each_known(memory):
-        assert steps(each, tmp_path) == []
+        assert steps(each) == []
 
 
 def stamped(
@@ -174,13 +173,12 @@ def stamped(
     return written(folder, at_beat)
 
 
-@pytest.mark.parametrize("by", [2.0, 0.8])
-@pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
+@pytest.mark.parametrize(("when", "by"), [(54.95, 2.0), (59.95, 0.8)])
 def test_a_clock_set_while_the_robot_stands_shows_in_stamps_of_another_clock(
     tmp_path: Path, when: float, by: float
 ) -> None:
     for memory in each_known(stamped(tmp_path, delay=lambda t: by * (t > when))):
-        [step] = steps(memory, tmp_path)
+        [step] = steps(memory)
         at = BEGIN + round(when - 0.05, 1)
         assert step == {
             "at": pytest.approx(at, abs=1e-5),
@@ -204,7 +202,7 @@ def test_pauses_that_are_not_looked_at_are_noted(
         assert not reply.get("clock_steps")
         assert any("only the newest 2 of 3 pauses" in note for note in reply["notes"]), tool
     monkeypatch.setattr(clock_steps, "_MOST_SUSPECTS", 3)
-    assert len(steps(memory, tmp_path)) == 1
+    assert len(steps(memory)) == 1
 
 
 def set_back_in_a_split(folder: Path, since: int, *, driven: bool = True) -> None:

@@ -62,13 +62,15 @@ QUESTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("tool", QUESTIONS)
+HOURS = ("23:59-00:02", -60, 120), ("23:00-23:59", -3600, -60)
+
+
 @pytest.mark.parametrize(
-    ("hours", "first", "last"),
-    [("23:59-00:02", -60, 120), ("23:00-23:59", -3600, -60)],
+    ("tool", "hours", "first", "last"),
+    [(tool, *HOURS[nth % 2]) for nth, tool in enumerate(QUESTIONS)],
 )
 def test_each_window_has_the_answer_that_it_has_alone(
-    memory: Memory, folder: Path, tool: str, hours: str, first: int, last: int
+    memory: Memory, tool: str, hours: str, first: int, last: int
 ) -> None:
     given = QUESTIONS[tool]
     reply = asked(memory, tool, between=hours, **SPAN, **given)
@@ -116,7 +118,7 @@ def _without_ages(value: Any) -> Any:
     return value
 
 
-def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path) -> None:
+def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory) -> None:
     reply = asked(memory, "trajectory_summary", between="12:00-13:00", **SPAN)
     assert (reply["error"], reply["reason"]) == ("no_data", "gap")
 

@@ -43,9 +43,7 @@ def bag_dir(memory: Memory) -> Iterator[Path]:
     LOST.replace(memory.index.bag_dir, [])
 
 
-def test_around_what_was_deleted_by_request_a_silence_stays_one(
-    memory: Memory, bag_dir: Path
-) -> None:
+def test_around_what_was_deleted_by_request_a_silence_stays_one(memory: Memory) -> None:
     """91 s of silence: 10 s of it deleted leave a part that is long enough, and one that is not."""
     append_losses(bag_dir, [Loss(SEEN, (BEGIN + 109) * S, (BEGIN + 119) * S, 9, "forgotten")])
     [left] = asked(memory, "memory_status")["silences"]
@@ -53,7 +51,7 @@ def test_around_what_was_deleted_by_request_a_silence_stays_one(
     assert left["silent_s"] == pytest.approx(71.0)
 
 
-def test_a_recap_has_it_as_an_event(memory: Memory, bag_dir: Path) -> None:
+def test_a_recap_has_it_as_an_event(memory: Memory) -> None:
     reply = asked(memory, "recap", start=BEGIN, end=BEGIN + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
     assert event["text"] == f"{SEEN} was silent"

@@ -49,7 +49,7 @@ def remembering(
     return memory_of(folder, clock=clock, limits=QuerySettings(kept=kept))
 
 
-def shown(memory: Memory, folder: Path) -> dict[str, Any]:
+def shown(memory: Memory) -> dict[str, Any]:
     reply: dict[str, Any] = asked(memory, "memory_status")
     return reply
 
@@ -59,14 +59,14 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(11)]
     splits = [log_entry(BEGIN + t * S, 20, "rosbag2_recorder", "opened") for t in range(0, 60, 10)]
     memory = remembering(tmp_path, [*driven, *splits])
-    assert shown(memory, tmp_path)["newest_age_s"] == 10.0  # of whoever recorded this
+    assert shown(memory)["newest_age_s"] == 10.0  # of whoever recorded this
     beat(tmp_path, BEGIN + 59 * S)
-    told = shown(memory, tmp_path)
+    told = shown(memory)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
     assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
     ahead = BEGIN + 365 * 86_400 * S
     write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead, 0.0, 0.0, 0.0)])
-    assert shown(memory, tmp_path)["newest_age_s"] == 50.0
+    assert shown(memory)["newest_age_s"] == 50.0
 
 
 def lost(kind: Any, begin_s: float, stop_s: float, count: int = 0, topic: str = "/odom") -> Loss:
@@ -104,7 +104,7 @@ def test_what_was_lost_is_a_doubt(
     memory = replace(memory, limits=replace(memory.limits, now=now))
     beat(tmp_path, BEGIN + 59 * S, lost={"/odom": 7})
     append_losses(tmp_path, losses)
-    told = shown(memory, tmp_path)
+    told = shown(memory)
     assert (told["doubts"], told["lost_last_hour"]) == (doubts, {"/odom": 7})
 
 
@@ -123,7 +123,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     )
     after = f"after {BEGIN // S + 49}.000000 messages may be missing, because "
     sentence = f"{after}ros2 bag record died, and the recorder ended without a shutdown"
-    assert shown(memory, tmp_path)["doubts"] == sentence
+    assert shown(memory)["doubts"] == sentence
     for until, notes in ((45, []), (60, [sentence])):
         window = {"start": BEGIN / S + 40, "end": BEGIN / S + until}
         recap = asked(memory, "recap", **window)
@@ -132,7 +132,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     messages = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(55, 60)]
     write_mcap(tmp_path / "later" / "later_0.mcap", messages)
     memory.index.refresh()
-    assert after not in shown(memory, tmp_path)["doubts"]
+    assert after not in shown(memory)["doubts"]
 
 
 def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     memory = remembering(tmp_path, seconds=1e6)
     memory = replace(memory, limits=replace(memory.limits, now=now))
     beat(tmp_path, BEGIN + 1 * S)
-    reply = shown(memory, tmp_path)
+    reply = shown(memory)
     assert (reply["recorder"], reply["recorder_alive"]) == told
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
 
@@ -182,7 +182,7 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
     memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * 86_400 * S))
     for counted, derived in ((4_900_000, 4_700_000), (200_000, 50_000)):
         beat(tmp_path, BEGIN + 59 * S, counted_bytes=counted, state_bytes=derived)
-        budget = shown(memory, tmp_path)["budget"]
+        budget = shown(memory)["budget"]
         assert (budget["used_gb"], budget["state_gb"]) == (counted / 1e9, derived / 1e9)
 
 
@@ -197,14 +197,14 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     if fills:
         memory = with_store(memory, tmp_path)
     else:
-        assert shown(memory, tmp_path)["doubts"] == SOUND
+        assert shown(memory)["doubts"] == SOUND
         asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
-    assert shown(memory, tmp_path)["doubts"].startswith("1 bag could not be read whole; data_time")
+    assert shown(memory)["doubts"].startswith("1 bag could not be read whole; data_time")
     [note] = asked(memory, "data_time_range")["notes"]
     assert note.startswith("rec/rec_0.mcap: damaged: ")
     write_mcap(bag, driven)
     memory.index.refresh()
-    assert shown(memory, tmp_path)["doubts"] == SOUND
+    assert shown(memory)["doubts"] == SOUND
 
 
 def recording(folder: Path, *listed: tuple[str, int]) -> None:
@@ -229,7 +229,7 @@ def test_a_file_without_an_end_may_be_being_written_or_left_by_a_crash(tmp_path:
     clock = SettableClock(path.stat().st_mtime_ns + S)
 
     def doubts(memory: Memory) -> str:
-        return str(shown(memory, tmp_path)["doubts"])
+        return str(shown(memory)["doubts"])
 
     memory, young = memory_of(tmp_path, clock=clock), "1 file has no end yet"
     assert young in doubts(memory)
@@ -264,7 +264,7 @@ def test_splits_and_messages_that_metadata_lists_and_no_file_has_are_counted(
 ) -> None:
     recording(tmp_path / "rec", *listed)
     (tmp_path / "rec" / beside).write_text("{}")
-    assert shown(memory_of(tmp_path), tmp_path)["doubts"].endswith(doubts)
+    assert shown(memory_of(tmp_path))["doubts"].endswith(doubts)
 
 
 def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(tmp_path: Path) -> None:
@@ -274,10 +274,10 @@ def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(tmp_path: 
     own.parent.mkdir()
     inode = (tmp_path / "rec").stat().st_ino
     own.write_text(with_checks('{"bag_dir_id": "5f0c"}'))
-    assert "lists 4 missing files" in shown(memory_of(tmp_path), tmp_path)["doubts"]
+    assert "lists 4 missing files" in shown(memory_of(tmp_path))["doubts"]
     with own.open("a") as stream:
         stream.write(with_checks(json.dumps({"recording": "rec", "inode": inode})))
-    assert "lists 1 missing file" in shown(memory_of(tmp_path), tmp_path)["doubts"]
+    assert "lists 1 missing file" in shown(memory_of(tmp_path))["doubts"]
 
 
 def test_nothing_behind_a_link_is_looked_at(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
 
 
-def in_both_frames(memory: Memory, folder: Path, span: dict[str, float]) -> tuple[Any, Any]:
+def in_both_frames(memory: Memory, span: dict[str, float]) -> tuple[Any, Any]:
     """What was driven, with waypoints in the frame of the poses, and in the map."""
     own = asked(memory, "trajectory_summary", **span)
     return own, asked(memory, "trajectory_summary", frame_id="map", **span)
@@ -37,7 +37,7 @@ def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_pat
     write_moving_map(tmp_path, 3, seconds=60)
     memory = memory_of(tmp_path)
     span = {"start": BEGIN / S, "end": BEGIN / S + 1000}
-    own, moved = in_both_frames(memory, tmp_path, span)
+    own, moved = in_both_frames(memory, span)
     inside = asked(memory, "trajectory_summary", where=LEFT, frame_id="map", **span)
     assert own["frame_id"] == "odom"
     assert moved["frame_id"] == inside["frame_id"] == "map"
@@ -69,7 +69,7 @@ def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bo
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     memory = memory_of(tmp_path, recalls=recalls)
     span = {"start": BEGIN / S, "end": BEGIN / S + 100}
-    own, moved = in_both_frames(memory, tmp_path, span)
+    own, moved = in_both_frames(memory, span)
     assert [each.get("jump", False) for each in own["waypoints"]] == [False, False]
     assert [(each["y"], each.get("jump", False)) for each in moved["waypoints"]] == [
         (0.0, False),
@@ -185,9 +185,7 @@ def memory(tmp_path: Path) -> Memory:
         ({"farthest_from": {"x": 1, "y": 2}, "frame_id": "moon"}, 'frame_id was "moon"'),
     ],
 )
-def test_what_is_no_point_is_named(
-    memory: Memory, tmp_path: Path, given: dict[str, Any], said: str
-) -> None:
+def test_what_is_no_point_is_named(memory: Memory, given: dict[str, Any], said: str) -> None:
     span = {"start": ROOMS_BEGIN, "end": ROOMS_BEGIN + 60}
     reply = asked(memory, "trajectory_summary", **span, **given)
     assert said in reply["detail"]

@@ -110,7 +110,7 @@ def test_the_parts_of_a_time_are_all_of_it_that_lie_in_a_place(memory: Memory) -
 
 @pytest.mark.parametrize("tool", ["find_matches", "trajectory_summary", "visits"])
 def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
-    memory: Memory, folder: Path, world: World, tool: str
+    memory: Memory, world: World, tool: str
 ) -> None:
     given: dict[str, Any] = {**(HELLO if tool == "find_matches" else {}), **SPAN}
     rows = table(asked(memory, tool, by="place", where=bounds("hall", "kitchen"), **given))
@@ -129,7 +129,7 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
         assert rows["(elsewhere)"]["seconds"] > 0
 
 
-def test_two_spellings_of_a_place_are_one(memory: Memory, folder: Path) -> None:
+def test_two_spellings_of_a_place_are_one(memory: Memory) -> None:
     given = {**HELLO, **SPAN, "by": "place"}
     once, twice = (
         asked(memory, "find_matches", where=where, **given)
@@ -157,7 +157,7 @@ def test_two_spellings_of_a_place_are_one(memory: Memory, folder: Path) -> None:
     ],
 )
 def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
-    memory: Memory, folder: Path, where: Any, said: str
+    memory: Memory, where: Any, said: str
 ) -> None:
     reply = asked(memory, "visits", where=where)
     assert reply["error"] == "invalid_arguments"
@@ -175,7 +175,7 @@ def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
     ],
 )
 def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
-    memory: Memory, folder: Path, given: dict[str, Any], said: str | None
+    memory: Memory, given: dict[str, Any], said: str | None
 ) -> None:
     reply = asked(memory, "visits", **given)
     assert (said is None) == ("error" not in reply)
@@ -184,7 +184,7 @@ def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
 
 @pytest.mark.parametrize("by", [None, "label"])
 def test_of_several_conditions_on_other_topics_all_must_hold(
-    memory: Memory, folder: Path, world: World, by: str | None
+    memory: Memory, world: World, by: str | None
 ) -> None:
     """In the hall, as two conditions on x say it together, and where a third one adds nothing."""
     low, high = ROOMS["hall"]

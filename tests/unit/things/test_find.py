@@ -16,7 +16,7 @@ from ros2_memory.core.text import abbreviate
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.things import unseen
 from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
-from tests.support.memories import asked, each_way, memory_of, replied
+from tests.support.memories import asked, memory_of, replied
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -85,8 +85,7 @@ def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
     return ask(bag_dir, **given)
 
 
-@each_way
-@pytest.mark.parametrize("map_off", [None, 0.0, 0.6], ids=["no map", "map", "map jumps"])
+@pytest.mark.parametrize(("recalls", "map_off"), [(False, None), (True, 0.0), (True, 0.6)])
 def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
     tmp_path: Path, recalls: bool, map_off: float | None
 ) -> None:
