@@ -1,7 +1,7 @@
 """A detector that was blind for a while, as each tool reports it."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -37,16 +37,12 @@ def memory(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return with_store(found, tmp_path) if request.param else found
 
 
-@pytest.fixture
-def bag_dir(memory: Memory) -> Iterator[Path]:
-    yield memory.index.bag_dir
-    LOST.replace(memory.index.bag_dir, [])
-
-
 def test_around_what_was_deleted_by_request_a_silence_stays_one(memory: Memory) -> None:
     """91 s of silence: 10 s of it deleted leave a part that is long enough, and one that is not."""
-    append_losses(bag_dir, [Loss(SEEN, (BEGIN + 109) * S, (BEGIN + 119) * S, 9, "forgotten")])
+    deleted = Loss(SEEN, (BEGIN + 109) * S, (BEGIN + 119) * S, 9, "forgotten")
+    append_losses(memory.index.bag_dir, [deleted])
     [left] = asked(memory, "memory_status")["silences"]
+    LOST.replace(memory.index.bag_dir, [])
     assert (left["start"], left["end"]) == (BEGIN + 119, BEGIN + 190.000001)
     assert left["silent_s"] == pytest.approx(71.0)
 
