@@ -1,29 +1,14 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.facts import (
-    BATTERY,
-    CHARGE,
-    COMMAND,
-    DIAGNOSTICS,
-    ERROR,
     FLAG,
-    GOAL,
-    GOALS,
     LABEL,
-    STATUS,
     State,
     Word,
-    charge_levels,
-    charge_of,
-    is_still,
-    state_of,
     stated_by,
 )
 from ros2_memory.analysis.topic_events import (
@@ -33,57 +18,7 @@ from ros2_memory.analysis.topic_events import (
     events_of,
     joined_events,
 )
-from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-
-TWIST = "geometry_msgs/msg/Twist"
-
-
-def stated(value: JsonValue, type_name: str) -> dict[Word, float]:
-    """The facts of a message, without the NaN of those that have no value."""
-    facts = state_of(value, type_name).facts
-    return {word: 0 if math.isnan(value) else value for word, value in facts}
-
-
-def test_statuses_and_goals_have_a_value_each_and_what_is_none_has_none() -> None:
-    status: JsonValue = {
-        "status": [
-            {"name": "camera", "level": 0, "message": "30 frames/s"},
-            {"name": "arm", "level": 2, "message": "stuck"},
-            {"name": 5, "level": 0},
-            "none",
-        ]
-    }
-    assert stated(status, DIAGNOSTICS) == {
-        Word(STATUS, "camera"): 0,
-        Word(STATUS, "arm", "stuck"): 2,
-        Word(ERROR, "arm: stuck"): 0,
-    }
-    goal: JsonValue = {"goal_info": {"goal_id": {"uuid": [0, 255]}}, "status": 2}
-    assert stated({"status_list": [goal, {"status": 1}, None]}, GOALS) == {Word(GOAL, "00ff"): 2}
-    assert stated(None, DIAGNOSTICS) == stated(7, GOALS) == {}
-
-
-@pytest.mark.parametrize(
-    ("reported", "charge"), [(1.0, 1.0), (1.02, 1.0), (1.5, 0.015), (80.0, 0.8)]
-)
-def test_a_full_battery_may_report_a_little_more(reported: float, charge: float) -> None:
-    assert charge_of({"percentage": reported}) == charge
-    assert (charge_levels(np.array([reported]))[0] > 0) == (charge < 0.2)
-
-
-numbers = st.sampled_from(
-    [0.0, -0.0, 1e-5, 0.04, 0.051, 0.21, 0.15, 0.3, 1.0, 1.02, 80.0, -2.0, math.nan, math.inf]
-)
-
-
-@given(st.lists(numbers, max_size=8))
-def test_values_of_columns_are_those_of_the_messages(rows: list[float]) -> None:
-    column = np.array(rows, np.float64)
-    charges = [stated({"percentage": number}, BATTERY).get(Word(CHARGE), -1) for number in rows]
-    assert charge_levels(column).tolist() == charges
-    commands = [stated({"linear": {"x": number}}, TWIST)[Word(COMMAND)] for number in rows]
-    assert (~is_still(column)).tolist() == commands
 
 
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(

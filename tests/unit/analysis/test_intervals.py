@@ -114,20 +114,3 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
         for one in inside:
             at = bisect_left([other.last for other in own], one.last)
             assert own[at].first <= one.first
-
-
-@given(histories())
-def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
-    messages: Messages,
-) -> None:
-    seen = watched(messages).visible
-    start, end = messages[0][0], messages[-1][0]
-    for label in seen.throughout(start, end):
-        times = {time for time, labels in messages if label in labels}
-        own = [one for one in seen.intervals() if one.label == label]
-        inside = [sorted(at for at in times if one.first <= at <= one.last) for one in own]
-        assert any(
-            max(after - before for before, after in pairwise([start, *some, end]))
-            <= max(NS_PER_S, 3 * (some[-1] - some[0]) / max(1, len(some) - 1))
-            for some in inside
-        )

@@ -1,8 +1,6 @@
 """How far, how fast and where a robot drove, by poses with noise, gaps, resets and turns."""
 
-import math
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -87,31 +85,6 @@ def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
 
 
 # Of these none is at the origin, where odometry may have begun anew.
-elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
-
-
-@given(st.lists(elsewhere, min_size=2, max_size=15))
-def test_of_few_poses_the_distance_is_the_plain_length(positions: list[Vector3]) -> None:
-    found = way_of(driven(positions), 1e9).trajectory()
-    length_m = math.fsum(math.dist(a, b) for a, b in pairwise(positions))
-    assert found.totals.distance_m == pytest.approx(length_m, rel=1e-12)
-    assert found.totals.jumps == 0
-    assert (found.max_speed or 0) >= (found.avg_speed or 0) >= 0
-
-
-@pytest.mark.parametrize(
-    ("xs", "drawn"),
-    [
-        ((0, 1, 2, 102, 103, 104, 5, 6), [(0, 0), (2, 0), (3, 1), (5, 0), (6, 1), (7, 0)]),
-        # It stands before and after, and is drawn until it jumps.
-        ((*(0.001 * (i % 2) for i in range(9)), 90, 90, 91), [(0, 0), (8, 0), (9, 1), (11, 0)]),
-    ],
-)
-def test_both_ends_of_a_jump_are_drawn_and_nothing_between_them(
-    xs: tuple[float, ...], drawn: list[tuple[int, int]]
-) -> None:
-    found = way_of(driven((x, 0.0, 0.0) for x in xs), 10.0).trajectory()
-    assert [((each.time - BEGIN) // S, each.jump) for each in found.waypoints] == drawn
 
 
 def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
