@@ -27,13 +27,13 @@ from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.storage.base import BagReader, Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, Msg, text, write_mcap
+from tests.support.bags import Msg, text, write_mcap
 from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
 from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
 from tests.support.shared_bags import REAL, needs_real
-from tests.unit.columns.drawn_tables import message, message_in
+from tests.unit.columns.drawn_tables import message_in
 
 T = TypeVar("T")
 NUMBERS: Final = frozenset(
@@ -391,20 +391,6 @@ def test_what_follows_long_sequences_is_read_where_it_is(
     assert len(table.elements["named"].elements["points"]) == rows * 43
     assert numbers(table, "scan.length")[0] == 2000
     assert fallbacks == []
-
-
-def test_images_have_times_alone_and_their_chunks_are_not_read(tmp_path: Path) -> None:
-    kind = "sensor_msgs/msg/Image"
-    images = [Msg("/camera", kind, time, message(kind, random.Random(1))) for time in range(10)]
-    messages = [*images, *(text(time, "x") for time in range(10, 20))]
-    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1000))
-    spoil_chunk(path, 0)
-    [tables] = groups_of(path)
-    by_topic = {table.channel.topic: table for table in tables}
-    assert by_topic["/camera"].log_times.tolist() == list(range(10))
-    assert by_topic["/camera"].columns == {}
-    assert "" in by_topic["/camera"].left_out
-    assert len(by_topic["/chatter"]) == 10
 
 
 def test_large_messages_of_large_files_have_times_alone(

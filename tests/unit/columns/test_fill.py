@@ -12,20 +12,18 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.bootstrap import build_repairer
 from ros2_memory.columns import decode, fill
 from ros2_memory.columns.decode import Group, undecoded
-from ros2_memory.columns.fill import Progress, StoreLimits
+from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.plan import Plan
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.walk import LevelColumns, read_columns
 from ros2_memory.columns.writing import ReadBag
-from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import BagReader, Batch
 from ros2_memory.storage.mcap import bulk
-from tests.support.bags import McapLayout, odom, text, write_db3, write_mcap
+from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.column_worlds import World, check_all, store_file, times
 
@@ -93,41 +91,6 @@ def test_bags_have_parts_together_also_beside_one_of_a_clock_that_was_ahead(
 # Bags that a crash cut short
 
 
-def test_what_a_crash_left_of_a_bag_is_stored_until_the_bag_is_closed(tmp_path: Path) -> None:
-    write_bag(tmp_path, 0)
-    path = tmp_path / "rec" / "rec_1.mcap"
-    poses = [odom(T0 + (60 + n) * S, n / 7, 0.0) for n in range(30)]
-    write_mcap(path, poses, McapLayout(chunk_size=400, finish=False))
-    os.utime(path, ns=(T0, T0))
-    world = World.of(tmp_path)
-    [_, cut] = world.memory.index.snapshot().timeline.bags
-    assert cut.state is BagState.INCOMPLETE
-    assert world.fill() == 2
-    assert world.stored() == {"rec/rec_0.mcap", "rec/rec_1.mcap"}
-    assert world.filling.progress(world.memory.index.snapshot().timeline) == Progress(1, 1)
-    assert check_all(world) > 0
-    assert count(world, "part", "level = 2") == count(world, "part")
-
-    assert build_repairer().repair(path)
-    again = World.of(tmp_path)
-    assert again.stored() == {"rec/rec_0.mcap"}
-    assert again.fill() == 1
-    check_all(again)
-
-
-def test_a_database_beside_its_journal_is_not_stored(tmp_path: Path) -> None:
-    """What is read of it changes with that, while its own file does not."""
-    path = tmp_path / "rec" / "rec_0.db3"
-    write_db3(path, [odom(T0 + n * S, 0.0, 0.0) for n in range(9)])
-    path.with_name(f"{path.name}-wal").write_bytes(b"half")
-    for file in path.parent.iterdir():
-        os.utime(file, ns=(T0, T0))
-    world = World.of(tmp_path)
-    [bag] = world.memory.index.snapshot().timeline.bags
-    assert bag.state is BagState.INCOMPLETE
-    assert world.fill() == 0
-
-
 # Retention
 
 
@@ -158,19 +121,6 @@ def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path:
     assert "rec/rec_59.mcap" in again.stored()
     assert min(before) not in again.stored()
     assert times(again, "/odom") == times(again.unstored(), "/odom")
-
-
-def test_with_a_bag_goes_all_that_it_had_alone(tmp_path: Path) -> None:
-    paths = [write_bag(tmp_path, number) for number in range(3)]
-    write_mcap(paths[2], [text(T0 + 120 * S, "word", "/other")])
-    os.utime(paths[2], ns=(T0, T0))
-    world = World.of(tmp_path)
-    world.fill()
-    assert count(world, "summary") == 2
-    for path in paths[1:]:
-        path.unlink()
-        world.prune()
-    assert (count(world, "bag"), count(world, "summary"), count(world, "deletion")) == (1, 1, 1)
 
 
 def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path) -> None:
@@ -205,24 +155,6 @@ def write_long_bag(bag_dir: Path, rows: int = 60) -> Path:
     path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
     os.utime(path, ns=(T0, T0))
     return path
-
-
-@pytest.mark.parametrize(("share", "dropped"), [(0.0, 3), (0.6, 2)])
-def test_what_one_part_drops_is_room_for_the_next(
-    tmp_path: Path, share: float, dropped: int
-) -> None:
-    for together in (True, False):
-        folder = tmp_path / str(together)
-        for slot in range(3):
-            write_bag(folder, slot * 10, rows=500, hz=100)
-        world = World.of(folder, limits=StoreLimits(max_share=1.0))
-        world.fill()
-        in_bags, needed = world.store.merged_bytes()
-        shares = [([part.number], 0) for part in world.store.parts("/odom")]
-        assert len(shares) == 3
-        for some in [shares] if together else [[each] for each in shares]:
-            assert world.store.thin(some, share * needed / in_bags)
-        assert count(world, "part", "dropped <> ''") == dropped
 
 
 @pytest.mark.usefixtures("small_groups")

@@ -4,7 +4,6 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,9 +25,8 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.view import View
-from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
-from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
 
@@ -170,10 +168,6 @@ def driven(number: int) -> list[Msg]:
     return [odom(start + n * 5 * S, number + n / 300, 0.1) for n in range(60)]
 
 
-def docked(number: int) -> list[Msg]:
-    return [boolean(pose.log_time, n % 7 > 3, "/docked") for n, pose in enumerate(driven(number))]
-
-
 @pytest.fixture(scope="module")
 def driven_world(length_of_stretches: None, tmp_path_factory: pytest.TempPathFactory) -> World:
     """Four stretches and a half in bags of 300 s, of three recordings."""
@@ -184,53 +178,6 @@ def driven_world(length_of_stretches: None, tmp_path_factory: pytest.TempPathFac
     driven_world = World.of(folder)
     driven_world.fill()
     return driven_world
-
-
-@pytest.fixture
-def latched(tmp_path: Path) -> World:
-    """Three recordings of two stretches each; each begins with what was said 5 s before."""
-    layout = McapLayout(latched=frozenset({"/docked"}))
-    for number in range(24):
-        messages = [*driven(number), *docked(number)]
-        if number and not number % 8:
-            last = docked(number - 1)[-1]
-            again = replace(last, log_time=last.log_time + 5 * S + 1, publish_time=last.log_time)
-            messages.insert(1, again)
-        write_mcap(tmp_path / f"rec_{number // 8}" / f"{number:02}.mcap", messages, layout)
-    driven_world = World.of(tmp_path)
-    driven_world.fill()
-    return driven_world
-
-
-def latched_stretches(driven_world: World) -> dict[int, tuple[int, ...] | None]:
-    opened = open_scan(View(driven_world.memory, Call()), "/docked", WINDOW)
-    return {one.window.start: one.parts for one in opened.stretches()}
-
-
-def test_what_was_received_again_is_of_the_parts_that_had_it_before_and_counts_without_them(
-    latched: World, tmp_path: Path
-) -> None:
-    parts = latched_stretches(latched)
-    own = [parts[T0 + n * LENGTH] or () for n in range(5)]
-    assert all(own)
-    # The third stretch begins a recording, with what the second ends with.
-    assert [len({*one} & {*other}) for one, other in pairwise(own)] == [0, 1, 0, 1]
-
-    def rows(driven_world: World) -> list[int]:
-        opened = open_scan(View(driven_world.memory, Call()), "/docked", WINDOW)
-        return [len(one) for one in opened.rows(among=TimeWindow(T0 + 2 * LENGTH, WINDOW.stop))]
-
-    def events(driven_world: World) -> object:
-        return events_in(View(driven_world.memory, Call()), "/docked", WINDOW)
-
-    before = rows(latched)
-    assert latched_stretches(latched)[T0 + 2 * LENGTH]
-    assert events(latched) == events(latched.unstored())
-    (tmp_path / "rec_0" / "07.mcap").unlink()
-    again = World.of(tmp_path)
-    assert (rows(again)[0], rows(again)[1:]) == (before[0] + 1, before[1:])
-    assert latched_stretches(again).get(T0 + 2 * LENGTH) is None
-    assert events(again) == events(again.unstored())
 
 
 def test_what_was_made_in_time_is_told_before_the_time_is_over(driven_world: World) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.table import MAX_NUMBERS
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
@@ -25,7 +24,6 @@ from tests.support.bags import (
     typestore,
     write_mcap,
 )
-from tests.support.column_worlds import World
 from tests.support.memories import asked, each_way, memory_of, with_store
 
 T0: Final = 1_790_000_000 * NS_PER_S
@@ -36,21 +34,6 @@ def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> M
     none = np.zeros(0)
     arrays = {"position": np.array(positions), "velocity": none, "effort": none}
     return Msg("/joints", kind, at, make(kind, header=header(at, ""), name=[*names], **arrays))
-
-
-def test_a_sequence_whose_columns_were_dropped_is_read_from_its_bag(tmp_path: Path) -> None:
-    """In one message, so that the owners of the elements are all equal, and are kept."""
-    xs = np.random.default_rng(1).normal(size=40).tolist()
-    kind, turn = "geometry_msgs/msg/PoseArray", quaternion(0.3)
-    poses = [make("geometry_msgs/msg/Pose", position=point(x, 0.5), orientation=turn) for x in xs]
-    body = make(kind, header=header(T0, ""), poses=poses)
-    write_mcap(tmp_path / "rec/rec_0.mcap", [Msg("/poses", kind, T0, body)])
-    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
-    world.fill()
-    for off, expected in ((-0.01, T0 / NS_PER_S), (0.01, None)):
-        above = {"condition_type": "above", "field": "poses.position.x", "value": max(xs) + off}
-        found = asked(world.memory, "find_last_match", topic="/poses", **above)
-        assert (found or {}).get("timestamp") == expected
 
 
 @each_way

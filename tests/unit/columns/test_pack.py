@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
-import re
-import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -22,15 +19,11 @@ from ros2_memory.columns.steps import (
     METRES,
     MOST_RELATIVE,
     QUATERNION,
-    RADIANS,
     RELATIVE,
-    VELOCITY,
     Step,
-    step_of,
 )
-from ros2_memory.columns.table import Texts, Zone, column_bytes, letters_of, may_be_in
+from ros2_memory.columns.table import Texts, Zone
 from ros2_memory.columns.zones import Zones
-from ros2_memory.storage.base import SEQUENCE, Definition, Field
 from tests.support.examples import examples
 
 if TYPE_CHECKING:
@@ -112,25 +105,6 @@ def allowed(step: Step, values: Values) -> Values:
     return np.abs(values.astype(np.float64)) * (MOST_RELATIVE if step.relative else 0.0)
 
 
-@settings(max_examples=examples(300), deadline=None)
-@given(st.one_of(integers, floats))
-def test_zones_are_exact(column: Values) -> None:
-    zone = pack(column, METRES).zone
-    there = [value for value in column.tolist() if not math.isnan(value)]
-    assert zone.least == min(there, default=None)
-    assert zone.greatest == max(there, default=None)
-    assert zone.nulls == len(column) - len(there)
-    assert zone.words is None
-    if zone.nulls in {0, len(column)} and len({*there}) <= 1:
-        assert pack(column, METRES).data == b""
-
-
-def test_what_is_unpacked_of_a_constant_column_is_one_value() -> None:
-    assert column_bytes(unpacked(pack(np.full(1000, 7, np.uint8)))) == 1
-    assert column_bytes(unpacked(pack(Texts.of(["map"] * 1000)))) < 100
-    assert column_bytes(unpacked(pack(np.arange(1000) / 3.0))) == 8 * 1000
-
-
 @settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.text(st.characters(codec=None), max_size=6), max_size=30))
 def test_texts_come_back_as_they_were(values: list[str]) -> None:
@@ -141,17 +115,6 @@ def test_texts_come_back_as_they_were(values: list[str]) -> None:
     assert back.codes.dtype == np.uint32
 
 
-def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
-    texts = [f'{{"label": "Größe {number}", "score": 0.{number}}}' for number in range(1000)]
-    zone = pack(Texts.of(texts)).zone
-    assert zone.words == "LETTERS\ngrösse\nlabel\nscore"
-    zones = Zones.of([1], [zone])
-    assert zones.may_be_json.all()
-    found = ["label", "abel", "größe 7".casefold(), '"score": 0.5', "12345"]
-    assert all(zones.may_have(text).all() for text in found)
-    assert not any(zones.may_have(text).any() for text in ("labels", "cup", "letters", "score cup"))
-
-
 def test_a_zone_of_texts_with_half_a_surrogate_can_be_stored() -> None:
     """JSON may have one; SQLite takes none."""
     zone = pack(Texts.of(["mug \ud83d", "bowl"])).zone
@@ -160,15 +123,6 @@ def test_a_zone_of_texts_with_half_a_surrogate_can_be_stored() -> None:
     zones = Zones.of([1], [zone])
     assert all(zones.may_have(text).all() for text in ("mug", "mug \ud83d", "\ud83d", "bowl"))
     assert not zones.may_have("cup").any()
-
-
-@given(st.lists(st.text(max_size=30), max_size=30), st.text(max_size=5))
-def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], text: str) -> None:
-    asked = text.casefold()
-    for padding in ([], [f"{number} " * 900 for number in range(3)]):
-        zone = pack(Texts.of([*values, *padding])).zone
-        if any(asked in value.casefold() for value in values):
-            assert Zones.of([1], [zone]).may_have(asked).all()
 
 
 def test_damaged_bytes_are_refused() -> None:
@@ -218,8 +172,6 @@ def test_a_signalling_nan_is_one_without_a_warning(size: int) -> None:
     assert pack(column, METRES).zone.nulls == 1
 
 
-T0 = 1_700_000_000 * 10**9
-
 BOUNDS = st.one_of(
     st.integers(-(2**63), 2**64 - 1),
     st.sampled_from([2**53, 2**53 + 1, -(2**53) - 1, 0, 1]),
@@ -227,7 +179,6 @@ BOUNDS = st.one_of(
     st.booleans(),
 )
 
-LIMITS = st.one_of(BOUNDS, st.just(10**400), st.just(-(10**400)))
 
 WORDS = st.one_of(st.none(), st.text("ab[{\n", max_size=6))
 
@@ -240,91 +191,3 @@ def zones(draw: st.DrawFn) -> Zone:
         return Zone()
     low, high = sorted((draw(BOUNDS), draw(BOUNDS)))
     return Zone(low, high)
-
-
-def is_exact(*numbers: float) -> bool:
-    return all(not math.isfinite(number) or abs(number) < 2**53 for number in numbers)
-
-
-@given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
-@example([Zone(0, sys.float_info.max)], 1, "")
-@example([Zone(0, math.inf)], 10**400, "")
-@example([Zone(-math.inf, 0)], -(10**400), "")
-def test_zones_rule_out_what_the_zone_of_each_part_does(
-    given_zones: list[Zone], limit: float, text: str
-) -> None:
-    together = Zones.of(range(1, len(given_zones) + 1), given_zones)
-    for nth, zone in enumerate(given_zones):
-        pairs = [
-            (zone.low <= limit <= zone.high, together.spans(limit)[nth]),
-            (zone.high > limit, together.reaches(limit, above=True)[nth]),
-            (zone.low < limit, together.reaches(limit, above=False)[nth]),
-        ]
-        for alone, among_others in pairs:
-            assert among_others or not alone
-            if is_exact(zone.low, zone.high) and abs(limit) < 2**53:
-                assert among_others == alone
-        words = zone.words
-        assert together.may_have(text)[nth] == (words is None or may_be_in(words, text))
-        may_be_json = words is None or any(may_be_in(words, mark) for mark in "[{")
-        assert together.may_be_json[nth] == may_be_json
-
-
-@given(st.text(st.characters(codec="ascii")) | st.text())
-@example("".join(map(chr, range(128))))
-def test_rows_of_letters_are_those_of_unicode(text: str) -> None:
-    assert letters_of(text) == re.findall(r"[^\W\d_]+", text)
-
-
-def definition_of(name: str, **fields: str | Definition) -> Definition:
-    return Definition(name, tuple(Field(field, kind) for field, kind in fields.items()))
-
-
-POINT = definition_of("geometry_msgs/msg/Point", x="float64", y="float64", z="float64")
-
-VECTOR = definition_of("geometry_msgs/msg/Vector3", x="float64", y="float64", z="float64")
-
-QUATERNIONS = definition_of(
-    "geometry_msgs/msg/Quaternion", x="float64", y="float64", z="float64", w="float64"
-)
-
-FIX = definition_of("sensor_msgs/msg/NavSatFix", latitude="float64", altitude="float64")
-
-ROBOT = Definition(
-    "demo_msgs/msg/Robot",
-    (
-        Field("corner", POINT),
-        Field("translation", VECTOR),
-        Field("linear", VECTOR),
-        Field("facing", QUATERNIONS),
-        Field("fix", FIX),
-        Field("yaw", "float64"),
-        Field("altitude", "float64"),
-        Field("steering_angle", "float32"),
-        Field("points", POINT, SEQUENCE),
-        Field("joints", definition_of("sensor_msgs/msg/JointState", position="float64")),
-    ),
-)
-
-
-@pytest.mark.parametrize(
-    ("path", "step"),
-    [
-        ("corner.x", METRES),
-        ("translation.z", METRES),
-        ("linear.x", VELOCITY),
-        ("facing.w", QUATERNION),
-        ("facing.x", QUATERNION),
-        ("fix.latitude", DEGREES),
-        ("fix.altitude", METRES),
-        ("altitude", RELATIVE),
-        ("yaw", RADIANS),
-        ("steering_angle", RADIANS),
-        ("points.y", METRES),
-        ("joints.position.", RADIANS),
-        ("joints.position.least", RADIANS),
-        ("unheard.of", RELATIVE),
-    ],
-)
-def test_steps_follow_the_type_of_the_message(path: str, step: Step) -> None:
-    assert step_of(path, ROBOT) == step

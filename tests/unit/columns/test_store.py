@@ -4,7 +4,6 @@ import hashlib
 import os
 import random
 import re
-import shutil
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -14,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
@@ -24,7 +22,7 @@ from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.pack import FORMAT, decompress
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import BagError
 from tests.support.bags import (
@@ -216,20 +214,6 @@ def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_p
     assert len(in_memory.stored()) == 4
 
 
-@pytest.mark.parametrize(("lost", "taken"), [("", 4), ("*-shm", 0)], ids=["whole", "no index"])
-def test_where_a_store_is_copied_from_nothing_changes(
-    world: World, tmp_path: Path, lost: str, taken: int
-) -> None:
-    """Also where its program was killed, so that its write-ahead log is there still."""
-    assert world.store.path is not None
-    folder = tmp_path / "strangers"
-    shutil.copytree(world.store.path.parent, folder, ignore=shutil.ignore_patterns(lost))
-    before = {path: path.read_bytes() for path in folder.iterdir()}
-    store = ColumnStore([tmp_path / "cache" / FILE], Mock(), sources=[folder / FILE])
-    assert len(store.paths()) == taken
-    assert {path: path.read_bytes() for path in folder.iterdir()} == before
-
-
 def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(
     world: World, tmp_path: Path
 ) -> None:
@@ -388,19 +372,6 @@ def test_a_full_disk_is_named_and_nothing_is_lost(tmp_path: Path) -> None:
     with files_limited_to(100_000), pytest.raises(BagError, match="disk I/O error"):
         forget(store_file(tmp_path), tmp_path, ["rec/rec_3.mcap"])
     assert len(World.of(tmp_path).stored()) == 8
-
-
-def test_servers_notice_what_was_forgotten(tmp_path: Path) -> None:
-    for number in range(2):
-        write_secret(tmp_path, number)
-    world = World.of(tmp_path)
-    world.fill()
-    assert check_all(world) == 242
-    state = world.store.state()
-    forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
-    assert world.store.state().deletion > state.deletion
-    assert check_all(world) == 242
-    assert world.stored() == set()
 
 
 def test_a_topic_that_is_stored_later_is_taken_for_none_that_was_forgotten(tmp_path: Path) -> None:

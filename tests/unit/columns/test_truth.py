@@ -1,6 +1,5 @@
 """Conditions over columns, and extracted values as trees: the same as of each decoded message."""
 
-from dataclasses import replace
 from random import Random
 
 import numpy as np
@@ -8,49 +7,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import Beyond, Condition
+from ros2_memory.analysis.conditions import Condition
 from ros2_memory.columns.shown import numbers
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import (
     TruthValues,
-    seconds,
 )
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.model import JsonValue
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES
-from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import (
     Drawn,
     condition_on,
-    drawn_of,
     drawn_tables,
-    message,
     paths_of,
     stored,
 )
 
 EXTRACTOR = shipped_extractor()
 
-STRING = "std_msgs/msg/String"
-
-PLAIN = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "tf2_msgs/msg/TFMessage",
-    "sensor_msgs/msg/BatteryState",
-    "rcl_interfaces/msg/Log",
-    "px4_msgs/msg/VehicleOdometry",
-    STRING,
-    "std_msgs/msg/Int64",
-    "std_msgs/msg/Float32",
-)
 
 RANDOM = st.randoms(use_true_random=False)
 
@@ -95,15 +76,6 @@ def values_of(drawn: Drawn, extractor: SchemaExtractor = EXTRACTOR) -> list[Json
     return [extractor.exact(message, drawn.type) for message in drawn.messages]
 
 
-@settings(max_examples=examples(60), deadline=None)
-@given(drawn_tables(PLAIN), RANDOM)
-def test_truth_is_sure_where_columns_hold_the_whole_value(drawn: Drawn, random: Random) -> None:
-    values = values_of(drawn)
-    for _ in range(4):
-        condition = condition_on(values, random)
-        assert judged(drawn.table, condition, values) == 0
-
-
 @settings(max_examples=examples(150), deadline=None)
 @given(
     drawn_tables(),
@@ -120,25 +92,6 @@ def test_truth_of_columns_is_that_of_each_message_or_unsure_where_they_were_roun
     table = drawn.table if step is None else stored(drawn.table, step)
     for _ in range(4):
         judged(table, condition_on(values, random), values, extractor)
-
-
-def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
-    found = ColumnCondition(condition, EXTRACTOR).truth(drawn_of(type_name, messages).table)
-    assert not found.unsure.any()
-    return [bool(each) for each in found.surely]
-
-
-@pytest.mark.parametrize("limit", [0.2, 0.7])
-def test_a_limit_is_not_beyond_itself_in_a_float32(limit: float) -> None:
-    kind, scans = "std_msgs/msg/Float32", "sensor_msgs/msg/LaserScan"
-    scan = message(scans, Random(3), is_odd=False)
-    scan.ranges = np.full(100, limit, np.float32)  # type: ignore[attr-defined]
-    for above, farther in ((True, 0.01), (False, -0.01)):
-        condition = Condition(Beyond(limit, above=above), "value")
-        both = (make(kind, data=limit), make(kind, data=limit + farther))
-        assert met(condition, kind, *both) == [False, True]
-        long = ColumnCondition(replace(condition, field="ranges"), EXTRACTOR)
-        assert not long.truth(drawn_of(scans, [scan]).table).surely.any()
 
 
 FULL_PATHS = (
@@ -184,15 +137,3 @@ def test_numbers_of_a_field_are_those_of_each_message_or_off_by_less_than_they_s
             expected = sorted(numbers_in(EXTRACTOR.exact_at(message_, drawn.type, field)))
             own = sorted(found.numbers[found.rows == row].tolist())
             assert own == pytest.approx(expected, abs=found.error, rel=0.0), field
-
-
-@given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
-def test_seconds_are_rounded_as_those_of_each_message(times: list[int]) -> None:
-    found = seconds(np.array(times, np.int64))
-    assert found.tolist() == [unix_from_ns(time) for time in times]
-
-
-def test_a_mapped_path_that_leads_into_times_is_left_to_the_bag() -> None:
-    extractor = SchemaExtractor({ODOMETRY: {"second": "header.stamp.sec"}}, 50)
-    table = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))]).table
-    assert numbers(table, "second", extractor) is None
