@@ -4,14 +4,12 @@ import math
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.context import Call, Memory, QuerySettings
@@ -105,15 +103,6 @@ def sizes_counted(memory: Memory, looks: Iterable[int]) -> set[int]:
     return sizes
 
 
-def test_numbers_of_a_call_that_runs_out_of_time_are_of_all_that_was_counted(
-    tmp_path: Path,
-) -> None:
-    write(tmp_path, CHARGES, split=30)
-    sizes = sizes_counted(memory_of(tmp_path, limits=LATEST), range(1, 120, 3))
-    assert len(sizes) > 2
-    assert max(sizes) == len(CHARGES)
-
-
 def test_no_number_is_lost_where_time_runs_out_after_all_are_counted(tmp_path: Path) -> None:
     write(tmp_path, CHARGES[:20], split=10)
     memory = memory_of(tmp_path, limits=LATEST)
@@ -158,45 +147,6 @@ def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
     assert len(rows) > 1
 
 
-def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(
-    tmp_path: Path,
-) -> None:
-    """Each six minutes begin with a sighting of a minute, and so does what was searched."""
-    messages = [battery(BEGIN + n * 10 * S, 0.9 if n % 36 < 6 else 0.1) for n in range(1040)]
-    write(tmp_path, messages, split=60)
-    memory = memory_of(tmp_path, limits=LATEST)
-
-    def count(call: Call) -> Bins:
-        return count_matches(
-            memory, call, "/battery_state", "above", 0.5, by="hour", field="percentage"
-        )
-
-    def hour(at: int) -> str:
-        return f"{datetime.fromtimestamp(at // S).astimezone().hour:02d}:00"
-
-    begins, last = [message.log_time for message in messages[::36]], messages[-1].log_time
-    sinces = set()
-    for looks in range(1, 60, 3):
-        with suppress(QueryTimeoutError):
-            answer = count(Call(deadline=limited(looks)))
-            since = last - (cells(answer, "recorded_s")[-1] or 0)
-            counted = [at for at in begins if at >= since]
-            by_hour = {
-                hour(at): [each for each in counted if hour(each) == hour(at)] for at in counted
-            }
-            assert {name for name, _ in answer.rows} == by_hour.keys()
-            for nth, some in enumerate([*(by_hour[name] for name, _ in answer.rows), counted]):
-                assert cells(answer, "count")[nth] == len(some)
-                assert cells(answer, "seconds")[nth] == len(some) * 60 * S
-                assert cells(answer, "first")[nth] == min(some)
-                assert cells(answer, "last")[nth] == max(some) + 60 * S
-            if since > BEGIN:
-                assert answer.notes[0].startswith(f"only what is after {since / S:.6f} is counted")
-            sinces.add(since)
-    assert BEGIN in sinces
-    assert len(sinces) > 3
-
-
 T0 = 1_790_000_000
 
 
@@ -235,14 +185,6 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     row = table(asked(memory, "get_topic_in_range", **given, by="hour"))["all"]
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]
-
-
-def test_a_field_that_there_is_not_is_refused(tmp_path: Path) -> None:
-    write(tmp_path, [battery(BEGIN, 0.9)], split=60)
-    with pytest.raises(InvalidArgumentsError, match="has no field 'percentge'"):
-        count_range(
-            memory_of(tmp_path), Call(), "/battery_state", span(), "hour", fields=["percentge"]
-        )
 
 
 def test_a_field_that_a_topic_has_no_more_is_that_of_its_window(tmp_path: Path) -> None:

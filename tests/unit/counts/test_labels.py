@@ -143,3 +143,6 @@ def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
     assert [row["value"] for row in changes["changes"]] == ["true", "no"] * 5 + [True, False] * 5
     values = asked(memory, "get_topic_in_range", **window, by="value")
     assert values["all"][0] == 20
+    notes = asked(memory, "get_topic_in_range", **window)["notes"]
+    kinds = "std_msgs/msg/String, std_msgs/msg/Bool"
+    assert f"the topic was recorded under several types: {kinds}" in notes

@@ -8,7 +8,6 @@ import pytest
 from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import (
     McapLayout,
-    battery,
     boolean,
     detections,
     odom,
@@ -99,58 +98,6 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
 
 
 @each_way
-@pytest.mark.parametrize("by", [{}, {"by": "day"}])
-def test_what_a_slow_topic_states_lasts_to_the_end_of_a_scope(
-    bag_dir: Path, by: dict[str, str], *, recalls: bool
-) -> None:
-    """Every 4 s it says no bump; docked from 100 to 400 s, and from 700 s on."""
-    docked = {"topic": DOCKED, "condition_type": "equals", "value": False}
-    given = {"topic": BUMPER, "condition_type": "equals", "value": False, "while": docked, **by}
-    memory = memory_of(bag_dir, recalls=recalls)
-    end = T0 / S + 402
-    answer = asked(memory, "find_matches", start=T0 / S, end=end, **given)
-    if by:
-        assert table(answer)["all"]["seconds"] == 102
-    else:
-        assert [each["duration_s"] for each in answer["sightings"]] == [2, 100]
-
-
-@each_way
-def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
-    tmp_path: Path, *, recalls: bool
-) -> None:
-    """True since 10 s; nothing is recorded from 100 to 103 s."""
-    beats = [odom(T0 + at * S // 10, 0.0, 0.0) for at in (*range(1000), *range(1030, 2001))]
-    beats += [battery(T0 + at * S + 1, 0.5) for at in (*range(100), *range(103, 200))]
-    said = [boolean(T0 + at * S, value, DOCKED) for at, value in ((0, False), (10, True))]
-    layout = McapLayout(latched=frozenset({DOCKED}))
-    write_splits(tmp_path, [*beats, *said], 50, layout=layout)
-    memory = memory_of(tmp_path, recalls=recalls)
-    window = {"topic": DOCKED, "start": T0 / S, "end": T0 / S + 200}
-    is_true = {**window, "condition_type": "equals", "value": True}
-    recorded_s = 200 - 10 - 3.1
-    for by in ("hour", "value"):
-        answer = asked(memory, "find_matches", **is_true, by=by)
-        whole = table(answer)["all"]
-        assert (whole["seconds"], whole["count"]) == (recorded_s, 1)
-    events = asked(memory, "recap", start=T0 / S, end=T0 / S + 200)["events"]
-    [flip] = [event for event in events if event["text"] == "/docked became true"]
-    assert ("duration_s" in flip, flip["goes_on"]) == (False, True)
-    answers = [
-        asked(memory, "find_matches", **is_true),
-        asked(memory, "get_topic_in_range", **window, changes=True),
-    ]
-    assert answers[0]["sightings"][0]["duration_s"] == 190
-    assert answers[1]["changes"][-1]["seconds"] == 190
-    for answer in answers:
-        assert any("nothing was recorded from" in note for note in answer["notes"])
-    later = {"topic": "/battery_state", "condition_type": "above", "value": 0.1}
-    while_true = {"while": {"topic": DOCKED, "condition_type": "equals", "value": True}}
-    answer = asked(memory, "find_matches", **later, field="percentage", by="hour", **while_true)
-    assert table(answer)["all"]["seconds"] > 180
-
-
-@each_way
 @pytest.mark.parametrize(("first", "began"), [(0, 3), (50, 3), (61, 2), (92, 1), (98, 0)])
 def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message_on(
     tmp_path: Path, first: int, began: int, *, recalls: bool
@@ -187,20 +134,9 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     assert whole(79, 95) == whole(85, 95) == [0, 0]
 
 
-def test_a_boolean_holds_on_in_a_day_of_which_a_message_a_minute_stayed(tmp_path: Path) -> None:
-    day = [battery(T0 + at * S, 0.5) for at in range(0, 3601, 60)]
-    write_mcap(tmp_path / "memory" / "20260921.thinned.mcap", day)
-    write_splits(tmp_path, [battery(T0 + at * S, 0.5) for at in range(90_000, 90_060)])
-    present = {"condition_type": "equals", "value": True, "field": "present", "by": "day"}
-    asks = {"topic": "/battery_state", **present, "start": T0 / S, "end": T0 / S + 3600}
-    answer = asked(memory_of(tmp_path), "find_matches", **asks)
-    assert table(answer)["all"]["seconds"] == 3600
-
-
 TRUE = 1_784_030_400
 UNSET = 86_400
 AHEAD = 2_082_758_400
-CUPS = "/vision/scene/scene_objects"
 
 
 @pytest.fixture
@@ -219,20 +155,6 @@ def whole(by: str = "hour") -> dict[str, object]:
     return {"start": 0, "end": AHEAD + 10, "by": by}
 
 
-def test_labels_of_a_wrong_clock_do_not_count(memory: Memory) -> None:
-    seen = {"topic": CUPS, "condition_type": "contains", "value": "cup", "by": "label"}
-    for window in ({}, {"start": 0, "end": AHEAD + 10}):
-        reply = asked(memory, "find_matches", **seen, **window)
-        found = table(reply)["all"]
-        assert (found["count"], found["seconds"]) == (1, 5.0)
-        assert found["first_unix"] == pytest.approx(TRUE, abs=0.001)
-        assert found["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
-        assert not any("recorded only" in note for note in reply["notes"])
-    reply = asked(memory, "find_matches", **seen, start=UNSET - 5, end=UNSET + 60)
-    assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
-    assert not any("recorded only" in note for note in reply["notes"])
-
-
 def test_no_value_holds_from_one_clock_to_the_next(memory: Memory) -> None:
     """The robot was idle at the end of 1970, and at the beginning of today."""
     reply = asked(memory, "get_topic_in_range", topic="/chatter", **whole("value"))
@@ -243,15 +165,3 @@ def test_no_value_holds_from_one_clock_to_the_next(memory: Memory) -> None:
     of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
     reply = asked(memory, "get_topic_in_range", topic="/chatter", **of_1970)
     assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
-
-
-@pytest.mark.parametrize(("begin", "count"), [(UNSET, 2), (AHEAD, 1)])
-def test_a_window_inside_of_a_bag_of_a_wrong_clock_counts_what_is_there(
-    memory: Memory, begin: int, count: int
-) -> None:
-    window = {"start": begin - 5, "end": begin + 60}
-    reply = asked(memory, "get_topic_in_range", topic="/odom", by="hour", **window)
-    assert table(reply)["all"]["count"] == count
-    condition = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
-    reply = asked(memory, "find_matches", **condition, **window)
-    assert reply["searched_from"] == begin

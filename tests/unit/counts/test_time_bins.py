@@ -19,7 +19,7 @@ from ros2_memory.counts.bins import (
 )
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, odom, write_mcap
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import write_moving_map
 from tests.support.tables import table
@@ -116,9 +116,6 @@ def test_more_bins_than_a_reply_has_room_for_are_refused() -> None:
         time_bins(TimeWindow(begin, begin + (MOST_DAYS + 1) * day), "hour", zone("UTC"))
 
 
-BEGIN = 1_784_059_400 * S
-
-
 def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> None:
     noon = round(datetime(2026, 3, 2, 12, 30).astimezone().timestamp())
     for begin in (noon, noon + 5 * 3600, noon + 3 * 86_400):
@@ -142,26 +139,6 @@ def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> Non
     weekdays, notes = rows("weekday")
     assert weekdays == ["Monday", "Thursday"]
     assert notes == [f"{start}Tuesday to Wednesday"]
-
-
-def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> None:
-    for name, begin in (("one", 0), ("two", 20_000)):
-        messages = [
-            boolean(BEGIN + (begin + at) * S, at >= 50, topic="/is_docked") for at in range(100)
-        ]
-        # The last message before the time without any is all that its bag has.
-        for number, split in enumerate((messages[:-1], messages[-1:])):
-            write_mcap(tmp_path / name / f"{name}_{number}.mcap", split)
-    memory = memory_of(tmp_path)
-    asks = {"topic": "/is_docked", "condition_type": "equals", "by": "day"}
-    for each in (memory, with_store(memory, tmp_path)):
-        docked = table(asked(each, "find_matches", **asks, value=True))["all"]
-        assert (docked["count"], docked["seconds"]) == (2, 2 * 49)
-        reply = asked(each, "find_matches", **asks, value="false")
-        off = table(reply)["all"]
-        # Twice it was off the dock from the beginning on: nobody saw it leave.
-        assert (off["count"], off["seconds"], off["recorded_s"]) == (0, 2 * 50, 2 * 99)
-        assert "usual_first" not in reply
 
 
 NESTED = (
