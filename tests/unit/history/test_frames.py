@@ -5,25 +5,16 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, repeat
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from ros2_memory.analysis.frames import static_at
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
-from ros2_memory.history import sessions
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.scan import scan
-from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
 from tests.support.bags import Msg, boolean, odom, tf, transform, write_splits
-from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
@@ -55,49 +46,6 @@ def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
 
 def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
     write_splits(folder.parent, messages, split_s, folder.name)
-
-
-@settings(max_examples=examples(30))
-@given(
-    received=st.lists(
-        st.tuples(st.sampled_from(["arm", "/arm", "eye"]), st.integers(0, 2)),
-        min_size=1,
-        max_size=12,
-    ),
-    at=st.integers(-1, 13),
-)
-def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repeated(
-    received: list[tuple[str, int]], at: int
-) -> None:
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        for nth, (child, x) in enumerate(received):
-            record(folder / "rec", [fixed(T0 + nth * S, "base_link", child, x)], split_s=1)
-        view = View(memory_of(folder), Call())
-        [[session]] = view.sessions.recorded_at(T0) or []
-        found = static_at(view.sessions.static(session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
-    expected: dict[str, float] = {}
-    for second, (child, x) in enumerate(received):
-        if second <= at or child.lstrip("/") not in expected:
-            expected[child.lstrip("/")] = float(x)
-    assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected
-
-
-def test_static_transforms_of_many_recordings_are_read_together_beside_one_being_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    places = [float(nth) for nth in range(9)]
-    for nth, x in enumerate(places):
-        at = T0 + 900 * S * nth
-        record(tmp_path / f"rec_{nth}", [fixed(at, "base_link", "eye", x), odom(at + S, 0.0, 0.0)])
-    view = View(memory_of(tmp_path, recalls=True), Call(used_active=True))
-    scanned = Mock(wraps=scan)
-    monkeypatch.setattr(sessions, "scan", scanned)
-    of_each = [
-        view.sessions.static(view.sessions.session_of(path)) for path in tmp_path.glob("rec_*")
-    ]
-    assert sorted(one.transform.translation[0] for [one] in of_each) == places
-    assert scanned.call_count < 6
 
 
 def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
@@ -177,14 +125,6 @@ def test_after_a_restart_a_transform_is_that_of_the_recording_that_goes_on(
             assert "sessions" not in str(found.get("notes"))
         if gap < 10 * S:
             assert x_of(memory, begin - S // 10) == 1.0
-
-
-def test_what_a_recording_lacks_is_that_of_one_that_has_just_ended(tmp_path: Path) -> None:
-    record(tmp_path / "rec_a", [fixed(T0, "map", "odom", 1.0), *drive(T0, 18)])
-    record(tmp_path / "rec_b", [fixed(T0 + 20 * S, "base", "eye", 2.0), *drive(T0 + 19 * S, 30)])
-    memory = memory_of(tmp_path)
-    assert x_of(memory, T0 + 22 * S) == 1.0
-    assert x_of(memory, T0 + 35 * S) == "frame_unknown"
 
 
 @each_way

@@ -13,7 +13,6 @@ from mcap.writer import Writer
 
 from ros2_memory import queries
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
-from ros2_memory.core.text import Reason
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
@@ -24,7 +23,6 @@ from tests.support.bags import (
     boolean,
     detections,
     odom,
-    text,
     tf,
     transform,
     write_db3,
@@ -33,7 +31,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.listed_bags import odom_bag
 from tests.support.mcap_surgery import chunks_of, spoil_chunk
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
 
@@ -211,29 +209,6 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
 
 
-@pytest.mark.parametrize("last", [9, 30], ids=["other topics go on", "the topic goes on"])
-def test_a_chunk_that_is_lost_is_not_reported_in_windows_behind_it_whatever_is_stored(
-    last: int, tmp_path: Path
-) -> None:
-    poses = [odom(T0 + n * S, n / 10, 0.0) for n in range(last)]
-    others = [text(T0 + n * S, "cup") for n in range(31)]
-    damaged = write_mcap(tmp_path / "a" / "a_0.mcap", [*poses, *others], McapLayout(chunk_size=400))
-    spoil_chunk(damaged, 0)
-    # The other recording may have copies of what the damaged one has.
-    copies = [text(T0 + 5 * S, "mug"), *(odom(T0 + n * S, 0.1, 0.0) for n in range(28, 40))]
-    write_mcap(tmp_path / "b" / "b_0.mcap", copies)
-    plain = memory_of(tmp_path)
-    stored = with_store(plain, tmp_path)
-    for start, is_lost in ((29, False), (5, False), (0, True)):
-        asking = {"topic": "/odom", "fields": ["position.x"], "by": "day", "end": at(50)}
-        replies = [
-            asked(memory, "get_topic_in_range", start=at(start), **asking)
-            for memory in (stored, plain)
-        ]
-        assert replies[0] == replies[1]
-        assert any("could not be read whole" in note for note in notes_of(replies[1])) is is_lost
-
-
 OBJECTS = "/vision/scene/scene_objects"
 
 CUP = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
@@ -348,18 +323,6 @@ def test_what_is_wrong_with_a_bag_is_reported_once(tmp_path: Path) -> None:
         assert "a/a_0.db3" in damaged
 
 
-@given(st.dictionaries(st.text(min_size=1), st.text(max_size=3), min_size=1))
-def test_one_sentence_counts_all_things_and_names_a_few(things: dict[str, str]) -> None:
-    reason = Reason("is torn", "bag", of="of ", many="are torn")
-    told = reason.sentence(things)
-    if len(things) == 1:
-        [(name, detail)] = things.items()
-        assert told == f"of {name} is torn" + (f": {detail}" if detail else "")
-    else:
-        assert told.startswith(f"of {len(things)} bags are torn: ")
-        assert len(told) < 700
-
-
 DAY = 24 * 3600 * S
 
 
@@ -368,24 +331,10 @@ def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
 
 
-def unreadable(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> SetAside:
-    return SetAside(Path(f"/b/{folder}/{folder}_{number}.mcap"), "torn", written)
-
-
 def sentences(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
     window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
     odd = snapshot.timeline.faulty(window)
     return list(unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd))
-
-
-def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
-    snapshot = Snapshot(
-        Timeline.of((listed(0),)), damaged=(unreadable(7, None, "alone"),), scanned_at=T0 + DAY
-    )
-    assert sentences(snapshot, 0, 9) == []
-    assert sentences(snapshot, 0, 9, nothing=True) == [
-        "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
-    ]
 
 
 def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:

@@ -340,37 +340,3 @@ def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
         if reply.is_error:
             assert "carries no" in reply.text or "no position" in reply.text, told
         assert all(abs(each) < 9e9 or each == 1e300 for each in times(value)), told
-
-
-@pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
-@pytest.mark.parametrize(("start", "end"), [(-1e300, -1e-6), (-5, -5), (-1, 0)])
-def test_a_window_below_zero_is_clamped_at_both_ends(
-    tmp_path: Path, begin_s: int, start: float, end: float
-) -> None:
-    messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
-    memory = memory_of(tmp_path, clock=SettableClock((begin_s + 9) * S))
-    window = {"start": start, "end": end}
-    told = asked(memory, "recap", **window)
-    assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
-    told = asked(memory, "find_matches", topic="/bumper", **SEARCH, **window)
-    assert (told["error"], told["reason"]) == ("no_data", "outside_range")
-    for tool in ("get_topic_in_range", "trajectory_summary"):
-        told = asked(memory, tool, topic="/odom", **window)
-        assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
-
-
-@pytest.mark.parametrize(("start", "end"), [(1.0, 2.0), (1e9, 1e9), (1.9e9, 2e9), (0.0, 2e9)])
-def test_no_span_that_was_searched_ends_before_it_begins(
-    tmp_path: Path, start: float, end: float
-) -> None:
-    begin = 1_784_000_000 * S
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
-    memory = memory_of(tmp_path)
-    window = {"start": start, "end": end}
-    told = asked(memory, "find_matches", topic="/bumper", **SEARCH, **window)
-    if not end > begin / S > start:
-        assert (told["error"], told["reason"]) == ("no_data", "outside_range")
-        return
-    assert start <= told["searched_from"] <= told["searched_to"] <= end
-    assert told["total"] > 0

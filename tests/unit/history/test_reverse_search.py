@@ -18,7 +18,7 @@ import pytest
 from mcap.writer import Writer
 
 from ros2_memory import queries
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory
@@ -191,12 +191,6 @@ def at(match: Match) -> int:
     return (match.found.sample.time - T0) // NS_PER_S
 
 
-def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
-    assert at(last(memory, "contains", "scissors")) == 1
-    assert reader.names == ["rec_0.mcap"]
-
-
 def test_a_bag_beyond_its_share_is_searched_by_its_columns(tmp_path: Path) -> None:
     draw = random.Random(7)
     xs = [draw.choice([-1, 1]) * draw.uniform(1, 9) for _ in range(1000)]
@@ -229,18 +223,6 @@ def test_what_never_was_is_answered_without_reading_a_message(
     memory, reader = filled(bag_dir)
     assert last(memory, condition_type, value, topic=topic).found is None
     assert not any(topics for _, topics in reader.asked)  # but the definitions of types
-
-
-def test_a_search_that_runs_out_of_time_has_searched_what_it_says(bag_dir: Path) -> None:
-    reached: set[int | None] = set()
-    for memory in (memory_of(bag_dir), filled(bag_dir)[0]):
-        for looks in range(1, 40):
-            call = Call(Deadline.after(looks + 0.5, partial(next, map(float, itertools.count()))))
-            try:
-                assert at(last(memory, "contains", "chair", topic="/*", call=call)) == 31
-            except QueryTimeoutError as error:
-                reached.add(error.searched_back_to)
-    assert min(each for each in reached if each is not None) > T0 + 31 * NS_PER_S
 
 
 def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(

@@ -121,18 +121,6 @@ def test_answers_from_messages_of_both_robots_say_so(both: Memory) -> None:
         assert any(MIXED.search(note) for note in notes), (tool, given)
 
 
-def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robots(
-    tmp_path: Path,
-) -> None:
-    for number, robot in enumerate(("red", "blue")):
-        said = [text(T0 + (60 * n + 30 * number) * S, f"{robot} {n}") for n in range(9)]
-        write_mcap(tmp_path / robot / f"{robot}_0.mcap", said)
-    for word in ("blue 4", "red 5"):
-        asks = {"topic": "/chatter", "condition_type": "equals", "value": word}
-        answer = asked(memory_of(tmp_path), "find_last_match", **asks)
-        assert [note for note in answer["notes"] if MIXED.search(note)]
-
-
 def test_the_path_of_loose_bags_that_overlap_at_their_ends_is_that_of_the_first(
     tmp_path: Path,
 ) -> None:
@@ -155,20 +143,6 @@ def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, objec
     compared = ask("compare", with_start=T0_S, with_end=T0_S + 30)
     assert any(unknown in note for note in compared["notes"])
     assert "distance_m" not in compared.get("way", {})
-
-
-@pytest.mark.parametrize("resting", [1, 20])
-def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
-    tmp_path: Path, resting: int
-) -> None:
-    for speed in (1.0, 2.0):
-        name, times = f"run_{speed:.0f}", range(S, 61 * S, S)
-        poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
-    memory = memory_of(tmp_path)
-    assert differing(memory) == [(("run_1", "run_2"), "/odom")]
-    told = asked(memory, "trajectory_summary", start=0, end=61)
-    assert told["reason"] == "mixed"
 
 
 def driving(begin: int, stop: int, x: float) -> list[Msg]:
@@ -288,17 +262,3 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         visits = asked(memory, "visits", x=35.0, y=0.0, radius_m=1.0)
         assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
         assert any("run has the time from" in note for note in visits["notes"])
-
-
-def test_a_path_by_transforms_over_a_clock_that_was_set_back_is_not_known(tmp_path: Path) -> None:
-    for number in range(4):
-        moves = []
-        for second in range(20 * number, 20 * number + 20):
-            at = T0 + (second - 30 * (number > 1)) * S
-            moves.append(tf(at, transform(at, "odom", "base_link", (second / 5, 0.0, 0.0))))
-        write_mcap(tmp_path / "run" / f"run_{number}.mcap", moves)
-    memory = memory_of(tmp_path)
-    refused = driven(memory, 0, 60)
-    assert (refused["reason"], refused["detail"][:11]) == ("mixed", "1 recording")
-    after = driven(memory, 41, 60)
-    assert after["distance_m"] == pytest.approx(1.6, abs=0.1)
