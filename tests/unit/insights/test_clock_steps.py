@@ -81,24 +81,6 @@ def steps(memory: Memory) -> list[Any]:
     return found
 
 
-def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_path: Path) -> None:
-    for name, begin in (("early", 0), ("late", 200)):
-        drive = [
-            odom((BEGIN + begin) * S + beat * S // HZ, SPEED * beat / HZ, 0.0, 0.0)
-            for beat in range(3 * HZ)
-        ]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", drive)
-    beside = [
-        boolean((BEGIN + begin) * S + beat * S // HZ, data=False)
-        for begin in (-100, 400)
-        for beat in range(3 * HZ)
-    ]
-    write_mcap(tmp_path / "beside" / "beside_0.mcap", beside)
-    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert (BEGIN + 200) * S in [pause.end for pause in memory.index.snapshot().pauses]
-    assert steps(memory) == []
-
-
 def late(t: float) -> float:
     """Messages wait for the recorder, ever shorter."""
     return max(0.0, 2.0 - 0.8 * (t - 55)) if t > 54.95 else 0.0

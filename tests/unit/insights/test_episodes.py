@@ -55,23 +55,6 @@ def ask(memory: Memory, tool: str, **given: object) -> Any:
     return asked(memory, tool, **given)
 
 
-def matches(memory: Memory, kind: str, value: str, **given: object) -> list[Any]:
-    reply = ask(memory, "find_matches", topic="/task", condition_type=kind, value=value, **given)
-    rows: list[Any] = reply["episodes"]
-    return rows
-
-
-def test_a_text_that_nothing_was_recorded_after_is_not_said_to_have_ended(memory: Memory) -> None:
-    cut, open_end = (
-        matches(memory, "contains", "pot", start=BEGIN + 290)[0],
-        ask(memory, "find_matches", topic="/task", condition_type="equals", value="rest")[
-            "episodes"
-        ][0],
-    )
-    assert (cut["end"], cut["ended"], cut["next"]["value"]) == (BEGIN + 320, False, "rest")
-    assert (open_end["end"], open_end["ended"]) == (BEGIN + 938, False)
-
-
 def test_changes_are_one_row_for_each_value_with_what_held_at_the_start(memory: Memory) -> None:
     window = {"start": BEGIN + 50, "end": BEGIN + 130}
     reply = ask(memory, "get_topic_in_range", topic="/task", changes=True, **window)
@@ -123,13 +106,6 @@ def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: 
         assert "field data of /octets" in reply["detail"]
         reply = ask(memory, "get_topic_in_range", **given, **how, fields=["data.7"])
         assert len(reply["changes"] if "changes" in how else reply["rows"]) == 10
-
-
-def test_a_field_that_texts_do_not_have_is_refused(memory: Memory) -> None:
-    given = {"topic": "/task", "condition_type": "contains", "value": "wash"}
-    assert ask(memory, "find_matches", **given, fields=["data"])["episodes"]
-    refused = ask(memory, "find_matches", **given, fields=["nope"])
-    assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
 
 
 def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(

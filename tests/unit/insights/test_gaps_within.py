@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from ros2_memory.history.context import Memory
-from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
@@ -94,15 +93,3 @@ def test_a_recorder_did_not_stall_where_another_recording_lies_within_its_pause(
     assert len(gaps(memory)) == 3 * len(STALLS) + 2
     doubts = ask(memory, "memory_status")["doubts"]
     assert doubts.endswith("while the recorder ran, nothing was recorded 6 times (11.13 s)")
-
-
-@pytest.mark.anyio
-async def test_health_counts_the_gaps_of_the_last_hour(tmp_path: Path) -> None:
-    memory = memory_with(tmp_path, at_rates())
-    late = replace(memory, clock=SettableClock((BEGIN + 3600 + 12) * S))
-    for asked_of, count, seconds in ((memory, 2, 3.71), (late, 1, 0.705)):
-        health = Health(asked_of, "1")
-        shown = await health()
-        health.stop()
-        gaps = {"count": count, "seconds": pytest.approx(seconds, abs=0.01)}
-        assert shown["gaps_last_hour"] == gaps

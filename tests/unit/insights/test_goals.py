@@ -2,11 +2,8 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
@@ -16,7 +13,6 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import McapLayout, Msg, goals, odom, write_mcap, write_splits
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
 
@@ -25,7 +21,6 @@ BEGIN = 1_784_000_000 * S
 TOPIC = "/drive/_action/status"
 
 Told = tuple[str, str, float, float | None, bool]
-History = list[tuple[int, Mapping[int, int]]]
 
 
 def told(
@@ -137,59 +132,6 @@ def test_a_search_of_a_window_finds_what_ended_in_it_by_a_status_that_there_is(
     assert found == [(2, "aborted", 42, 42, False)]
     with pytest.raises(InvalidArgumentsError, match=r"aborted \(0 to 6\), or failed"):
         found_in(memory_of(tmp_path), "equals", "lost")
-
-
-ENDS = st.sampled_from([4, 5, 6])
-
-
-@settings(max_examples=examples(15))
-@given(
-    st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
-    st.integers(1, 5),
-    st.booleans(),
-)
-def test_however_the_history_is_cut_the_same_is_told(
-    runs: list[tuple[int, int, int]], cut: int, recalls: bool
-) -> None:
-    at, expected, statuses = 5, [], dict[int, int]()
-    messages: History = [(1, {})]
-    words = {4: "succeeded", 5: "canceled", 6: "aborted"}
-    for goal, (pause, length, end) in enumerate(runs):
-        at += pause
-        begun, at = at, at + length
-        statuses = {**statuses, goal: 2}
-        messages.append((begun, statuses))
-        statuses = {**statuses, goal: end}
-        messages.append((at, statuses))
-        expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
-    with TemporaryDirectory() as folder:
-        found = told(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
-        searched = found_in(memory_of(Path(folder), recalls=recalls), "above", 3, "status")
-    assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
-    assert [
-        (f"/drive goal {status} after {end - begin:g} s", begin, end)
-        for _, status, begin, end, _ in reversed(searched)
-    ] == expected
-
-
-def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Path) -> None:
-    """Nothing says how it ended; then another recording begins, in which it is not said either."""
-    goes_on = history((10, {1: 2}), (30, {1: 4}), (50, {1: 4, 2: 2}))
-    beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(100)]
-    messages = sorted([*goes_on, *beats], key=lambda message: message.log_time)
-    write_splits(tmp_path, messages)
-    executing = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
-    for later in (0, 1):
-        for nth in range(later):
-            beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(900, 950)]
-            write_mcap(tmp_path / "next" / f"next_{nth}.mcap", beats)
-        memory = memory_of(tmp_path)
-        for end, lasted in ((60, 10), (2_000, 49)):
-            given = {**executing, "start": BEGIN / S, "end": BEGIN / S + end}
-            reply = asked(memory, "find_matches", **given)
-            assert [row["duration_s"] for row in reply["sightings"]] == [lasted]
-            reply = asked(memory, "find_matches", **given, by="day")
-            assert table(reply)["all"]["seconds"] == lasted
 
 
 def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_status(

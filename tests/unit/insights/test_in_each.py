@@ -92,15 +92,6 @@ def test_each_window_has_the_answer_that_it_has_alone(
     assert reply.get("all", {}) == pytest.approx(sums, abs=0.01)
 
 
-@pytest.mark.parametrize("hours", ["00:00-24:00", "12:00-12:00"])
-def test_what_comes_as_hours_end_and_begin_counts_once(tmp_path: Path, hours: str) -> None:
-    ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(24 * DAYS + 1)]
-    write_mcap(tmp_path / "bag.mcap", ticks)
-    given = {"topic": "/chatter", "start": MIDNIGHT, "end": MIDNIGHT + DAYS * DAY_S}
-    reply = asked(memory_of(tmp_path), "get_topic_in_range", **given, between=hours)
-    assert reply["all"]["total"] == len(ticks)
-
-
 def test_a_month_of_dates_has_the_hours_of_its_own_days(tmp_path: Path) -> None:
     ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(-24, 24 * 32)]
     write_mcap(tmp_path / "bag.mcap", ticks)
@@ -116,11 +107,6 @@ def _without_ages(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_ages(each) for key, each in value.items() if key != "ago_s"}
     return value
-
-
-def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory) -> None:
-    reply = asked(memory, "trajectory_summary", between="12:00-13:00", **SPAN)
-    assert (reply["error"], reply["reason"]) == ("no_data", "gap")
 
 
 def test_what_none_of_the_hours_have_is_said_as_it_is_without_them(

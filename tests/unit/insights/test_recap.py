@@ -25,12 +25,9 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
-    tf,
-    transform,
     write_mcap,
     write_splits,
 )
-from tests.support.clocks import SettableClock
 from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
@@ -52,21 +49,6 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     assert note == (
         f"/many has too many booleans or things in one message: {more} more are not followed"
     )
-
-
-def test_a_time_to_come_is_named_as_it_was_asked(tmp_path: Path) -> None:
-    write_splits(tmp_path, [boolean(BEGIN + n * S, False) for n in range(10)])
-    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 12 * S))
-    start, end = (f"{BEGIN // S + after_s}.000000" for after_s in (60, 90))
-    assert f"nothing was recorded between {start} and {end}" in over(memory, 60, 90).notes
-
-
-def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
-    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
-    write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
-    for end, goes_on in ((15, True), (40, False), (60, False)):
-        events = over(memory_of(tmp_path), 0, end).events
-        assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
 
 
 def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) -> None:
@@ -94,18 +76,6 @@ PLACES = (
 def in_places(memory: Memory, frame_id: str = "map") -> Memory:
     places = tuple(replace(each, frame_id=frame_id) for each in PLACES)
     return replace(memory, limits=replace(memory.limits, places=places))
-
-
-def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None:
-    messages = [odom(BEGIN + n * S // 20, 0.0, 2.0, 0.0) for n in range(1200)]
-    for n in range(600):
-        x = 60.5 if n >= 300 else 0.0
-        at = BEGIN + n * S // 10 + S // 50
-        messages.append(tf(at, transform(at, "map", "odom", (x, 0.0, 0.0))))
-    write_splits(tmp_path, messages)
-    events = over(in_places(memory_of(tmp_path)), 0, 60).events
-    [stop] = [each for each in events if each.kind == "stop"]
-    assert (stop.text, stop.places) == ("stood at x 0.00, y 2.00", ("room",))
 
 
 def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
@@ -172,46 +142,6 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
 
 
-def test_how_long_a_robot_stood_that_publishes_poses_only_while_it_moves_is_not_known(
-    tmp_path: Path,
-) -> None:
-    body = [boolean(BEGIN + n * S, n % 2 > 0, "/bumper") for n in range(121)]
-    body += [
-        odom(BEGIN + n * S // 10, n * 0.05, 0.0, 0.0) for n in range(1200) if n // 200 % 2 == 0
-    ]
-    write_splits(tmp_path, body)
-
-    def stood(memory: Memory, end_s: int) -> object:
-        given = {"start": BEGIN / S, "end": BEGIN / S + end_s}
-        return asked(memory, "recap", **given)["stood_s"]
-
-    for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
-        assert stood(memory, 120) is None
-        assert stood(memory, 19) == 0
-
-
-@each_way
-@pytest.mark.parametrize("latched", [frozenset[str](), frozenset({"/docked"})])
-def test_a_boolean_may_toggle_with_the_first_message_of_a_window(
-    tmp_path: Path, latched: frozenset[str], *, recalls: bool
-) -> None:
-    """It is said when it changes; nothing is recorded from 60 to 70 s."""
-    said = ((0, True), (30, False), (75, True), (100, False))
-    messages = [boolean(BEGIN + at * S, value, "/docked") for at, value in said]
-    messages += [odom(BEGIN + at * S, 0.0, 0.0) for at in range(120) if not 60 <= at < 70]
-    write_splits(tmp_path, messages, layout=McapLayout(latched=latched))
-    memory = memory_of(tmp_path, recalls=recalls)
-
-    def flips(begin: float, end: float) -> list[tuple[float, str]]:
-        events = over(memory, begin, end).events
-        return [((each.start - BEGIN) / S, each.text) for each in events if each.kind == "flip"]
-
-    assert flips(0, 50) == flips(20, 50) == [(30, "/docked became false")]
-    assert flips(31, 50) == []
-    assert flips(65, 90) == ([(75, "/docked became true")] if latched else [])
-    assert flips(80, 110) == [(100, "/docked became false")]
-
-
 def at(seconds: float) -> int:
     return BEGIN + round(seconds * S)
 
@@ -271,40 +201,12 @@ def test_what_changed_is_listed_the_nearest_first(bag_dir: Path, recalls: bool) 
     assert "notes" not in reply
 
 
-def test_how_far_back_can_be_asked_and_a_stop_knows_what_changed_before_the_window(
-    bag_dir: Path,
-) -> None:
-    memory = memory_of(bag_dir)
-    assert told(before(memory, 43.0, seconds_before=1)) == [
-        ("/cmd_vel went to zero while a goal was active", 0.0),
-        ("/bumper became true", 0.4),
-    ]
-    assert before(memory, 43.0, seconds_before=61)["error"] == "invalid_arguments"
-    reply = asked(memory, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
-    [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
-    assert "/bumper became true" in [each["text"] for each in stop["before"]]
-
-
 def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:
     trembling = [battery(at(t), 0.209 - t * 0.0002 + 0.008 * (-1) ** t) for t in range(60)]
     write_splits(tmp_path, [*trembling, boolean(at(59), True)])
     reply = before(memory_of(tmp_path), 60.0, seconds_before=60)
     below = [each for each in reply["before"] if "fell below" in each["text"]]
     assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
-
-
-def test_levels_without_a_name_are_numbers_and_long_texts_end_with_an_ellipsis(
-    tmp_path: Path,
-) -> None:
-    text = "the current is above what is allowed " * 3
-    levels = [diagnostics(at(t), motor=(7, text) if t > 38 else (0, "ok")) for t in range(60)]
-    write_splits(tmp_path, [*driving(60, 43), *levels])
-    reply = before(memory_of(tmp_path), 43.0)
-    [(sentence, _)] = told(reply)
-    assert sentence.startswith("status of motor became level 7: the current is above")
-    assert sentence.endswith("…")
-    assert len(sentence) == 100
-    assert reply["state"] == {"status of motor": "level 7"}
 
 
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:

@@ -29,7 +29,6 @@ from ros2_memory.insights.saved_moments import (
 )
 from ros2_memory.results import RememberedMoment
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
@@ -226,23 +225,3 @@ def test_the_file_that_keeps_moments_from_being_listed_is_named(
 def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:
     (tmp_path / MOMENTS_FOLDER).write_text("no folder")
     assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"label": ""}, "is empty"),
-        ({"label": "x" * 121}, "longer than 120"),
-        ({"label": "a\nb"}, "cannot be seen"),
-        ({"label": "\ud800"}, "cannot be seen"),
-        ({"label": "a", "seconds_before": 3601}, "is more than 3600"),
-        ({"label": "a", "seconds_after": 601}, "is more than 600"),
-        ({"label": "a", "seconds_after": -1}, "at least 0"),
-    ],
-)
-def test_arguments_of_the_tool_that_saves_moments_are_bounded(
-    given: dict[str, Any], said: str
-) -> None:
-    [tool] = [tool for tool in build_tools(QuerySettings(), writing=True) if tool.writes]
-    with pytest.raises(Exception, match=said):
-        tool.question(given)

@@ -30,7 +30,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, memory_of
 from tests.support.tables import table
 
 S = 10**9
@@ -140,32 +140,6 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
-@each_way
-def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -> None:
-    seen = [json.dumps({"label": label}) for label in ("кружка", "cup", 'the "big" one')]
-    said = [text(BEGIN + n * S, word, topic="/seen") for n, word in enumerate(seen)]
-    write_splits(tmp_path, said)
-    memory = memory_of(tmp_path, recalls=recalls)
-    for value, at in (("Кружка", 0), ('"big"', 2)):
-        for condition_type in ("contains", "contains_word"):
-            found = find_matches(memory, Call(), "/seen", condition_type, value).sightings
-            assert [sighting.first for sighting in found] == [BEGIN + at * S]
-
-
-def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
-    driven = [odom(BEGIN + t * S, float(t), 0.0, 0.0, vx=0.1 * t) for t in range(10)]
-    write_splits(tmp_path, [*driven, boolean(BEGIN + 9 * S, True)])
-    memory = memory_of(tmp_path)
-    fast = {"condition_type": "above", "value": 0.45, "field": "linear_velocity.x"}
-    reply = asked(memory, "find_matches", topic="/odom", fields=["position.x"], **fast)
-    assert reply["sightings"][0]["value"] == {"position.x": 9.0}
-    bumped = {"condition_type": "equals", "value": True}
-    given = {"topic": "/*", "fields": "data", **bumped}
-    assert asked(memory, "find_matches", **given)["sightings"][0]["value"] == {"data": True}
-    refused = asked(memory, "find_matches", topic="/odom", fields=["nope"], **fast)
-    assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
-
-
 def running_out(ask: Callable[[Call], Any]) -> Iterator[Any]:
     """What is answered where the clock may be looked at ever more often before the time is over."""
     for looks in range(1, 60):
@@ -173,34 +147,6 @@ def running_out(ask: Callable[[Call], Any]) -> Iterator[Any]:
             yield ask(Call(Deadline.after(looks, iter(range(10_000)).__next__)))
         except QueryTimeoutError:
             yield None
-
-
-def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
-    tmp_path: Path,
-) -> None:
-    write_splits(tmp_path, [boolean(BEGIN + t * S, True) for t in range(60)])
-    memory = memory_of(tmp_path)
-    counts = []
-    for answer in running_out(
-        lambda call: find_matches(memory, call, "/bumper", "equals", value=True)
-    ):
-        if answer is not None:
-            [sighting] = answer.sightings
-            counts.append(sighting.messages)
-            assert answer.more != sighting.begun
-            assert sighting.begun == (sighting.messages == 60)
-            assert sighting.begun != any("ran out of time" in note for note in answer.notes)
-    assert counts == sorted(counts)
-    assert counts[0] < 60 == counts[-1]
-
-
-def test_a_search_ends_early_enough_to_say_what_it_found(tmp_path: Path) -> None:
-    write_splits(tmp_path, [boolean(BEGIN + t * S, True) for t in range(20)], 1)
-    # A clock that goes on by 0.1 s at each look.
-    call = Call(Deadline.after(4, (look / 10 for look in range(1000)).__next__))
-    answer = find_matches(memory_of(tmp_path), call, "/bumper", "equals", value=True)
-    assert any("ran out of time" in note for note in answer.notes)
-    assert call.deadline.left_s() > 1
 
 
 def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_all(
