@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
@@ -19,11 +18,10 @@ from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, tf, transform, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
-from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.moving_map import BEGIN, S
 from tests.support.rooms import BEGIN as ROOMS_BEGIN
 from tests.support.rooms import ROOMS, asked_of, draw, write
 
-LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
 
 
@@ -31,28 +29,6 @@ def in_both_frames(memory: Memory, span: dict[str, float]) -> tuple[Any, Any]:
     """What was driven, with waypoints in the frame of the poses, and in the map."""
     own = asked(memory, "trajectory_summary", **span)
     return own, asked(memory, "trajectory_summary", frame_id="map", **span)
-
-
-def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 3, seconds=60)
-    memory = memory_of(tmp_path)
-    span = {"start": BEGIN / S, "end": BEGIN / S + 1000}
-    own, moved = in_both_frames(memory, span)
-    inside = asked(memory, "trajectory_summary", where=LEFT, frame_id="map", **span)
-    assert own["frame_id"] == "odom"
-    assert moved["frame_id"] == inside["frame_id"] == "map"
-    assert moved["distance_m"] == own["distance_m"]
-    assert [each["timestamp"] for each in moved["waypoints"]] == [
-        each["timestamp"] for each in own["waypoints"]
-    ]
-    # Before the first correction no transform leads to the map, and the first one holds.
-    for each in moved["waypoints"][1::4]:
-        there = asked(memory, "get_position_at", timestamp=each["timestamp"], frame_id="map")
-        for name in ("x", "y", "yaw_deg"):
-            assert each[name] == pytest.approx(there[name], abs=0.02)
-    assert all(-1.1 <= each["x"] <= 2.1 for each in inside["waypoints"])
-    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
-        trajectory_summary(memory, Call(), ALL, frame_id="moon")
 
 
 @each_way
@@ -78,21 +54,6 @@ def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bo
     note = "map jumped before 1 waypoint: the line to there was not driven"
     assert note in moved["notes"]
     assert note not in own["notes"]
-
-
-@each_way
-def test_what_was_driven_up_to_a_gap_was_not_driven_in_it(tmp_path: Path, recalls: bool) -> None:
-    """Stands for 5 s, then drives straight on at 0.2 m/s; from x 3 to x 6 nothing is recorded."""
-    messages = []
-    for step in (*range(400), *range(700, 1300)):
-        at, x = BEGIN + step * S // 20, 0.2 * max(step / 20 - 5, 0.0)
-        messages += [odom(at, x, 0.0, vx=0.0), tf(at, transform(at, "map", "odom", (0, 0, 0)))]
-    write_splits(tmp_path, messages, 15)
-    memory = memory_of(tmp_path, recalls=recalls)
-    given = {"start": BEGIN / S, "end": BEGIN / S + 65, "where": {"x": [-1, 4], "y": [-1, 1]}}
-    inside = asked(memory, "trajectory_summary", **given)
-    driven = [inside["distance_m"], inside["max_speed"]]
-    assert driven == pytest.approx([3.0, 0.2], abs=0.02)
 
 
 def test_where_the_map_jumped_before_its_time_was_over_is_not_known(

@@ -3,25 +3,21 @@
 import math
 from dataclasses import replace
 from functools import partial
-from itertools import chain, count, repeat
+from itertools import chain, repeat
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
-from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.visits import visits
-from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap, write_splits
+from tests.support.bags import odom, tf, transform, write_splits
 from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
-from tests.support.tables import table
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
@@ -34,23 +30,6 @@ PLACES = (
 
 def in_places(memory: Memory) -> Memory:
     return replace(memory, limits=replace(memory.limits, places=PLACES))
-
-
-@pytest.mark.parametrize("period_s", [3, 7])
-def test_a_way_between_two_poses_that_leaves_a_place_is_one_visit(
-    tmp_path: Path, period_s: int
-) -> None:
-    corners = ((0, 0), (6, 0), (6, 4), (4, 4), (4, 1), (2, 1), (2, 4), (0, 4))
-    horseshoe = Polygon(tuple((float(x), float(y)) for x, y in corners))
-    at = [BEGIN + nth * period_s * S for nth in range(8)]
-    across = (-6.0, -6.0, -2.5, 1.0, 5.0, 8.5, 12.0, 12.0)
-    poses = [odom(time, x, 3.0) for time, x in zip(at, across, strict=True)]
-    write_mcap(tmp_path / "rec/rec_0.mcap", poses)
-    memory = memory_of(tmp_path)
-    places = (Place("horseshoe", "odom", horseshoe),)
-    memory = replace(memory, limits=replace(memory.limits, places=places))
-    [visit] = visits(memory, Call(), where="horseshoe", limit=10).visits
-    assert (visit.arrived, visit.departed) == (at[3], at[4])
 
 
 @pytest.fixture(scope="module")
@@ -84,42 +63,6 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
 def spots(memory: Memory, **where: Circle | Rectangle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
-
-
-@pytest.mark.parametrize(
-    ("recalls", "latched"),
-    [(False, ()), (True, ()), (False, ("/odom",))],
-    ids=["plain", "catalogue", "latched"],
-)
-def test_each_of_two_robots_in_a_folder_is_in_its_place(
-    tmp_path: Path, recalls: bool, latched: tuple[str, ...]
-) -> None:
-    """The second one has a track of its own, in every tool that takes a place."""
-    words = [text(BEGIN + n * S, "hello") for n in range(90)]
-    for name, since, x, said in (("left", 0, 0.0, words), ("right", 5, 30.0, [])):
-        poses = [odom(BEGIN + since * S + n * S // 5, x + 9 * (n >= 150), 0.0) for n in range(400)]
-        messages = sorted([*poses, *said], key=lambda message: message.log_time)
-        layout = McapLayout(latched=frozenset(latched))
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
-    memory = memory_of(tmp_path, recalls=recalls)
-    memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
-    hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
-
-    def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
-        return table(asked(memory, tool, **given))[row]
-
-    places = asked(memory, "visits")["places"]
-    assert [(row["place"], row["exits"], row["minutes"]) for row in places] == [
-        ("here", 1, 0.5),
-        ("there", 1, 0.5),
-    ]
-    for name, first in (("here", 0), ("there", 5)):
-        seen = asked(memory, "visits", where=name)
-        assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
-        assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
-        [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
-        assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
-        assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
 
 
 def test_a_place_that_the_robot_passes_more_often_than_poses_are_always_read_for_has_no_visit(
@@ -166,18 +109,3 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
             assert known.track.x.max() == 5.0
     assert len(known_since) > 10
     assert None in known_since
-
-
-def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(
-    tmp_path: Path,
-) -> None:
-    write_moving_map(tmp_path, 1, seconds=100, split_s=2.0)
-    outcomes = set()
-    for looks in range(1, 40, 4):  # how often the clock may be looked at before the time is over
-        # A memory of its own each time: what one call found out, the next knows.
-        view = View(memory_of(tmp_path), Call(Deadline.after(looks, map(float, count()).__next__)))
-        try:
-            outcomes.add(map_placement(view, "/odom", "map").frame_id)
-        except QueryTimeoutError:
-            outcomes.add("timeout")
-    assert outcomes == {"map", "timeout"}

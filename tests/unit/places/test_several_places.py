@@ -3,9 +3,7 @@
 What is expected is counted from the drawn world itself, second by second.
 """
 
-import json
 import math
-from itertools import combinations_with_replacement
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,10 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import View
-from ros2_memory.places.where import Scope
+from ros2_memory.history.context import Memory
 from tests.support.bags import (
     boolean,
     octets,
@@ -29,7 +24,7 @@ from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S
-from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, write
+from tests.support.rooms import BEGIN, ROOMS, World, asked_of, bounds, draw, write
 from tests.support.tables import table
 
 SECONDS = 400
@@ -94,20 +89,6 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
             assert by_place[room]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
 
 
-def test_the_parts_of_a_time_are_all_of_it_that_lie_in_a_place(memory: Memory) -> None:
-    window = TimeWindow(BEGIN * S, (BEGIN + SECONDS) * S)
-    scope = Scope(View(memory, Call()), window, "hall, kitchen")
-    inside = [*scope.narrowed()][::-1]
-    assert len(inside) > 3
-    ends = {at + off for part in inside for at in (part.start, part.stop) for off in (-1, 0, 1)}
-    for first, last in combinations_with_replacement(sorted(ends), 2):
-        assert scope.parts_of(first, last) == [
-            (max(first, part.start), min(last, part.stop - 1))
-            for part in inside
-            if part.overlaps(first, last)
-        ]
-
-
 @pytest.mark.parametrize("tool", ["find_matches", "trajectory_summary", "visits"])
 def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
     memory: Memory, world: World, tool: str
@@ -127,15 +108,6 @@ def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
             expected = sum(run.messages for run in world.runs_in(room))
             assert rows[room]["seconds"] == pytest.approx(expected, abs=len(world.runs_in(room)))
         assert rows["(elsewhere)"]["seconds"] > 0
-
-
-def test_two_spellings_of_a_place_are_one(memory: Memory) -> None:
-    given = {**HELLO, **SPAN, "by": "place"}
-    once, twice = (
-        asked(memory, "find_matches", where=where, **given)
-        for where in (["hall", "den"], ["hall", "den", "Hall "])
-    )
-    assert twice == once
 
 
 @pytest.mark.parametrize(
@@ -180,33 +152,6 @@ def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
     reply = asked(memory, "visits", **given)
     assert (said is None) == ("error" not in reply)
     assert said is None or said in reply["detail"]
-
-
-@pytest.mark.parametrize("by", [None, "label"])
-def test_of_several_conditions_on_other_topics_all_must_hold(
-    memory: Memory, world: World, by: str | None
-) -> None:
-    """In the hall, as two conditions on x say it together, and where a third one adds nothing."""
-    low, high = ROOMS["hall"]
-    x = {"topic": "/odom", "field": "position.x"}
-    both = [
-        {**x, "condition_type": "above", "value": low},
-        {**x, "condition_type": "below", "value": high},
-        {"topic": "/chatter", "condition_type": "equals", "value": "hello"},
-    ]
-    given = {**HELLO, "topic": "/chatter" if by != "label" else SEEN, "limit": 100}
-    given |= {"value": "" if by == "label" else "hello"} | ({} if by is None else {"by": by})
-    found = asked(memory, "find_matches", **given, **{"while": both})
-    assert found == asked(memory, "find_matches", **given, **{"while": json.dumps(both)})
-    runs = world.runs_in("hall")
-    if by is None:
-        assert [
-            (row["first_seen"] - BEGIN, row["last_seen"] - BEGIN)
-            for row in reversed(found["sightings"])
-        ] == [(run.first, run.last) for run in runs]
-    else:
-        within = asked(memory, "find_matches", **given, where="hall")
-        assert found["rows"] == within["rows"]
 
 
 @each_way

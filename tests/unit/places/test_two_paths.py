@@ -1,6 +1,5 @@
 """Two ways of the robot, against points that are laid along them one by one."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -11,11 +10,9 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.robot_track import RobotTrack
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Rectangle
 from ros2_memory.places.two_paths import (
     PlacedStandstill,
     farthest_apart,
-    placed_standstills,
     stood_at,
 )
 from tests.support.examples import examples
@@ -66,24 +63,6 @@ def test_the_farthest_point_is_as_far_as_any_laid_along_the_way(
         here = np.array(point.place)
         assert np.hypot(*(own - here).T).min() < 0.03
         assert np.hypot(*(other - here).T).min() == pytest.approx(point.away_m, abs=0.03)
-
-
-def test_a_vertex_that_was_jumped_to_and_from_is_no_place_of_the_way() -> None:
-    way = track([(0.0, 0.0, 0.0), (9.9, 1.0, 0.0), (10.0, 50.0, 0.0), (10.1, 1.0, 0.0)])
-    way = dataclasses.replace(way, fastest_mps=10.0)
-    far = farthest_apart((way, EVER), (track([(0.0, 0.0, 0.0)]), EVER))[0]
-    assert far is not None
-    assert far.place[0] == 1.0
-
-
-def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:
-    way = track([(0.0, 1.0, 2.0), (20.0, 1.0, 2.0)], [(100.0, 7.0, 2.0), (120.0, 7.0, 2.0)])
-    spans = [(2 * S, 18 * S), (50 * S, 70 * S), (105 * S, 115 * S)]
-    assert [*placed_standstills(way, spans)] == [
-        PlacedStandstill(1.0, 2.0, 2 * S, 16 * S),
-        PlacedStandstill(7.0, 2.0, 105 * S, 10 * S),
-    ]
-    assert len([*placed_standstills(way, spans, Rectangle(5.0, 8.0, 0.0, 3.0))]) == 1
 
 
 stands = st.lists(

@@ -2,7 +2,6 @@
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap, write_splits
+from tests.support.bags import Msg, boolean, odom, text, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.tables import table
@@ -42,52 +41,6 @@ def life(seconds: int, silent: Mapping[str, Sequence[tuple[float, float]]] | Non
         for one in messages
         if not any(a <= one.log_time / S - T0 < b for a, b in quiet.get(one.topic, ()))
     ]
-
-
-def test_pauses_of_the_recording_are_no_unknown_time(tmp_path: Path) -> None:
-    """What was not recorded is in the gaps: a robot that is off is nowhere."""
-    write_splits(tmp_path, life(60), name="first")
-    later = [replace(one, log_time=one.log_time + 600 * S) for one in life(60)]
-    write_splits(tmp_path, later, name="second")
-    memory = memory_of(tmp_path)
-    for scope in ({"where": HERE}, {"while": CALM}):
-        assert "unknown_s" not in asked(memory, "find_matches", **PRESSED, **scope)
-    assert "unknown_s" not in asked(memory, "visits", **HERE)
-
-
-@pytest.mark.parametrize("latched", [False, True])
-def test_what_a_seldom_topic_said_holds_in_another_run_only_if_it_is_latched(
-    tmp_path: Path, latched: bool
-) -> None:
-    layout = McapLayout(latched=frozenset({"/mood"} if latched else ()))
-    write_splits(tmp_path, life(60, {"/mood": [(1, 60)]}), name="first", layout=layout)
-    said = life(60, {"/mood": [(0, 30), (31, 60)]})
-    later = [replace(one, log_time=one.log_time + 600 * S) for one in said]
-    write_splits(tmp_path, later, name="second", layout=layout)
-    answer = asked(memory_of(tmp_path), "find_matches", **PRESSED, **{"while": CALM})
-    begins = [row["first_seen"] - T0 for row in answer["sightings"]]
-    assert begins == [600 if latched else 630, 0]
-    assert answer.get("unknown_s") == (None if latched else 30)
-
-
-def test_a_time_that_a_recording_has_twice_is_unknown_however_short_it_is(tmp_path: Path) -> None:
-    """After 30 s the clock is set back by 5 s."""
-    messages = life(60)
-    later = [replace(one, log_time=one.log_time - 5 * S) for one in messages[len(messages) // 2 :]]
-    write_mcap(tmp_path / "run" / "run_0.mcap", messages[: len(messages) // 2])
-    write_mcap(tmp_path / "run" / "run_1.mcap", later)
-    memory = memory_of(tmp_path)
-    whole = table(asked(memory, "visits", **HERE, by="hour"))["all"]
-    told = [
-        *(
-            asked(memory, "find_matches", **PRESSED, **scope)
-            for scope in ({"where": HERE}, {"while": PRESSED})
-        ),
-        asked(memory, "visits", **HERE),
-        whole,
-    ]
-    assert [each["unknown_s"] for each in told] == pytest.approx([4.8] * 4, abs=0.05)
-    assert whole["placed_s"] + whole["unknown_s"] == pytest.approx(whole["recorded_s"], abs=0.1)
 
 
 def brute(times: Sequence[int], first: int, last: int, start: int, end: int) -> int:

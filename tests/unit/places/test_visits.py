@@ -2,7 +2,7 @@ import random
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from hypothesis import assume, example, given, settings
@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import (
     UndecodableError,
 )
-from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
-from tests.support.bags import Msg, odom, tf, transform, write_mcap, write_splits
+from tests.support.bags import Msg, odom, tf, transform, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.examples import LONG
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -44,23 +43,6 @@ def remembering(folder: Path, messages: list[Msg], *, split_s: float = 10.0) -> 
 def at(memory: Memory, now: int) -> Memory:
     """The memory, asked at another time."""
     return replace(memory, clock=SettableClock(now))
-
-
-@pytest.mark.parametrize("now", ["wall", "latest"])
-def test_a_robot_that_is_there_still_has_not_departed(
-    tmp_path: Path, now: Literal["wall", "latest"]
-) -> None:
-    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
-    memory = replace(memory, limits=replace(memory.limits, now=now))
-    if now == "wall":
-        memory = at(memory, BEGIN + 75 * S)
-    shown = asked(memory, "visits", **THERE)
-    assert shown["there_now"] is True
-    [visit] = shown["visits"]
-    assert visit["departed"] is None
-    assert visit["ago_s"] == 0.0
-    assert visit["arrived"] == pytest.approx(BEGIN / S + 18.0, abs=0.21)
-    assert "notes" not in shown
 
 
 def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
@@ -205,31 +187,3 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
         [(inside[0], inside[-1])],
         [(inside[0], None)],
     )
-
-
-@pytest.mark.parametrize("body", ["base_link", "chassis"])
-def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path, body: str) -> None:
-    at = [BEGIN + nth * S // 10 for nth in range(600)]
-    messages = [
-        each
-        for nth, time in enumerate(at)
-        for each in (
-            tf(time, transform(time, "odom", body, (nth * 0.05, 0.0, 0.0))),
-            tf(time, transform(time, "map", "odom", (1 + 0.001 * nth, 2.0, 0.0))),
-        )
-    ]
-    write_mcap(tmp_path / "rec/rec_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    found = asked(memory, "get_position_at", timestamp=BEGIN / S + 40)
-    assert found["x"] == pytest.approx(1.4 + 20.0, abs=0.1)
-    # It is in places of its odometry, too, as where a topic has its poses.
-    places = (Place("dock", "odom", Circle(10.0, 0.0, 1.0)), Place("hall", "map", Circle(11, 2, 1)))
-    memory = replace(memory, limits=replace(memory.limits, places=places))
-    table = asked(memory, "visits")["places"]
-    assert [(row["place"], row["entries"], row["minutes"]) for row in table] == [
-        ("dock", 1, 0.07),
-        ("hall", 1, 0.07),
-    ]
-    for asks in ({"where": "dock"}, {"x": 10.0, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"}):
-        seen = asked(memory, "visits", **asks)
-        assert (seen["frame_id"], seen["total"]) == ("odom", 1)
