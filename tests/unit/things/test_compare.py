@@ -13,7 +13,6 @@ from ros2_memory.things.places import Sightings, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
 from tests.support.memories import asked, memory_of
 from tests.unit.things.test_find import (
-    AWAY,
     BEGIN,
     HERE,
     NAMED,
@@ -24,7 +23,6 @@ from tests.unit.things.test_find import (
 
 MUG = ("mug", 3.0, 0.5)
 BOOK = ("book", 3.5, -1.0)
-FAR_MUG = ("mug", -2.0, 0.5)
 EARLIER = {"with_start": BEGIN, "with_end": BEGIN + 29}
 LATER = {"start": BEGIN + 60, "end": BEGIN + 89}
 
@@ -56,52 +54,6 @@ def test_things_that_stand_together_are_compared_by_their_number(tmp_path: Path)
     assert (labels(reply), reply["things_unchanged"]) == ({"more_or_fewer": ["cup"]}, 0)
     same = compared(tmp_path / "same", [*looked(0, 30, HERE, *cups), *looked(60, 90, HERE, *cups)])
     assert (same["things"], same["things_unchanged"]) == ({}, 1)
-
-
-def test_a_thing_that_was_moved_to_and_fro_is_unchanged(tmp_path: Path) -> None:
-    visits = [*(0.5,) * 4, *(0.1,) * 4, *(0.48,) * 4]
-    messages = [
-        each
-        for nth, y in enumerate(visits)
-        for each in looked(nth * 120, nth * 120 + 30, HERE, ("mug", 3.0, y), BOOK)
-    ]
-    first = {"with_start": BEGIN, "with_end": BEGIN + 470}
-    last = {"start": BEGIN + 960, "end": BEGIN + 1430}
-    assert labels(compared(tmp_path, messages, **first, **last)) == {}
-    moved = ask_compare(tmp_path, **first, start=BEGIN + 480, end=BEGIN + 950)
-    assert labels(moved) == {"moved": ["mug"]}
-
-
-def test_places_are_those_of_the_two_windows(tmp_path: Path) -> None:
-    """The mug is in the kitchen, in between elsewhere, and then not looked at."""
-    messages = [
-        *looked(0, 20, HERE, MUG),
-        *looked(30, 40, HERE),
-        *looked(40, 55, AWAY, FAR_MUG),
-        *looked(60, 90, (9.0, 9.0, 0.0)),
-    ]
-    reply = compared(tmp_path / "gone", messages, where="kitchen")
-    [mug] = reply["things"]["not_seen_where_expected"]
-    assert mug["was"] == {"x": 3.0, "y": 0.5, "in": "kitchen", "last_seen": BEGIN + 19}
-    back = compared(
-        tmp_path / "back", messages, where="kitchen", start=BEGIN, end=BEGIN + 25,
-        with_start=BEGIN + 60, with_end=BEGIN + 89,
-    )  # fmt: skip
-    assert back["things"] == reply["things"]
-    # What came in between, from a place that it had before both windows, is new there.
-    fresh = [
-        *looked(0, 20, AWAY, FAR_MUG),
-        *looked(20, 30, AWAY),
-        *looked(30, 50, HERE, BOOK),
-        *looked(60, 90, HERE, BOOK, MUG),
-    ]
-    window = {"with_start": BEGIN + 30, "with_end": BEGIN + 50}
-    reply = compared(tmp_path / "fresh", fresh, where="kitchen", **window)
-    [mug] = reply["things"]["appeared"]
-    assert mug == {
-        "label": "mug",
-        "is": {"x": 3.0, "y": 0.5, "in": "kitchen", "first_seen": BEGIN + 60},
-    }
 
 
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
@@ -277,13 +229,3 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
     assert any("localisation was poor" in note for note in reply.get("notes", [])) == is_poor
-
-
-def test_a_thing_that_was_only_seen_while_localisation_was_poor_is_listed(tmp_path: Path) -> None:
-    write_splits(tmp_path, [amcl(0, 2.0), *seen_off(0, 30, 0.0)])
-    reply = ask(tmp_path, "find_things", label="mug")
-    [mug] = reply["things"]
-    assert (mug["place"]["y"], mug["count"]) == (0.5, 30)
-    [note] = reply["notes"]
-    assert note.startswith("localisation was poor")
-    assert note.endswith(": mug")

@@ -181,21 +181,6 @@ def test_a_thing_that_is_detected_without_a_place_is_not_missed(
     assert "could not be placed: cup (60 times" in note
 
 
-def test_a_thing_is_missed_by_what_follows_its_last_detection_without_a_place(
-    tmp_path: Path,
-) -> None:
-    cup, lost = ("cup", 3.0, 0.0), ("cup", math.nan, math.nan)
-    seen, away = [*looked(0, 30, HERE, cup), *looked(30, 60, HERE)], looked(60, 70, AWAY, lost)
-    [unknown] = told_of(tmp_path / "unknown", [*seen, *away])["things"]
-    assert unknown["still_there"] == {"not_looked_at_since": BEGIN + 29}
-    [missed] = told_of(tmp_path / "missed", [*seen, *away, *looked(70, 100, HERE)])["things"]
-    assert missed["still_there"]["not_seen_where_expected"] > BEGIN + 70
-    # What never says where it saw something does not say that it was this.
-    said = [text((BEGIN + 61) * S, json.dumps({"label": "cup", "score": 0.5}))]
-    [also_missed] = told_of(tmp_path / "also", [*seen, *said])["things"]
-    assert "not_seen_where_expected" in also_missed["still_there"]
-
-
 @pytest.mark.parametrize(("chairs", "notes"), [(110, 0), (140, 1)])
 def test_all_chairs_of_a_hall_are_counted_or_it_is_said_that_some_are_not(
     tmp_path: Path, chairs: int, notes: int

@@ -1,7 +1,6 @@
 """When a thing is missed, and which name it has, by its sights alone."""
 
 import math
-import tracemalloc
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
@@ -9,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.sights import DetectorMessages, Sights, fixes_of, sights_of
+from ros2_memory.analysis.sights import DetectorMessages, Sights, sights_of
 from ros2_memory.columns.sights import JoinedSights, join_sights, pack_sights
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.model import Vector3
@@ -59,17 +58,6 @@ def seen_at(x: float, y: float) -> list[PlacedDetection]:
     return [PlacedDetection("mug", (x, y, 0.7))]
 
 
-def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None:
-    there = [bag_of(*[(HERE, seen_at(2, 0))] * 10)]
-    twice = bag_of(*[(HERE, [])] * 2, start=100)
-    often = bag_of(*[(HERE, [])] * 8, start=110)
-    [mug] = estimate(whole([*there, twice]), LABELS).instances
-    assert mug.missed_by is None
-    assert mug.looks == 2
-    [mug] = estimate(whole([*there, twice, often]), LABELS).instances
-    assert mug.missed_by == 117 * 10**9
-
-
 @pytest.mark.parametrize("away_m", [0.62, 0.88, 0.92, 0.96])
 def test_a_thing_that_was_moved_by_less_than_a_metre_after_long_is_where_it_was_seen_last(
     away_m: float,
@@ -81,14 +69,6 @@ def test_a_thing_that_was_moved_by_less_than_a_metre_after_long_is_where_it_was_
     assert (len(mug.stays), mug.missed_by) == (2, None)
 
 
-@pytest.mark.parametrize("away_m", [0.62, 0.9])
-def test_a_second_thing_that_comes_beside_one_after_long_is_a_second_thing(away_m: float) -> None:
-    alone = [(HERE, seen_at(2, 0))] * 1800
-    both = [(HERE, [*seen_at(2, 0), *seen_at(2, away_m)])] * 60
-    found = estimate(whole([bag_of(*alone, *both)]), LABELS).instances
-    assert [(len(each.stays), each.stays[0].count) for each in found] == [(1, 1860), (1, 60)]
-
-
 def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() -> None:
     """In each slice both are seen, and none goes to and fro between the two places."""
     alone = [(HERE, seen_at(2, 0))] * 2400
@@ -97,24 +77,6 @@ def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() 
     [mugs] = found.instances
     [stay] = mugs.stays
     assert (stay.count, found.side_by_side(stay.spots)) == (2700, 2)
-
-
-def test_what_was_seen_once_from_each_of_three_poses_and_mostly_not_is_no_thing() -> None:
-    bags = []
-    for nth, y in enumerate([-3.0, 0.0, 3.0] * 10):
-        pose = (0.0, y, 0.0)
-        seen = [seen_at(4, 0)] if nth < 3 else [[]]
-        bags.append(bag_of(*[(pose, things) for things in (*seen, *[[]] * 4)], start=100 * nth))
-    assert estimate(whole(bags), LABELS).instances == []
-
-
-def test_what_is_seen_upstairs_while_localisation_is_poor_is_no_sighting_of_what_is_below() -> None:
-    below = bag_of(*[(HERE, seen_at(2, 0))] * 20)
-    upstairs = bag_of((HERE, [PlacedDetection("mug", (2.0, 0.0, 3.7))]), start=100)
-    times = np.array([95, 106], np.int64) * 10**9
-    vague = fixes_of(times, np.zeros((2, 3)), np.array([2.0, 2.0]))
-    [mug] = estimate(whole([below, upstairs, vague]), LABELS).instances
-    assert mug.stays[-1].last == 19 * 10**9
 
 
 def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place() -> None:
@@ -129,20 +91,6 @@ def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place(
     [mug] = estimate(whole([bag]), LABELS).instances
     assert len(mug.stays) == 4
     assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
-
-
-@pytest.mark.parametrize("name", ["{} box", "box{}"])
-def test_labels_without_a_place_are_compared_with_none_and_take_no_more_memory_each_if_many(
-    name: str,
-) -> None:
-    labels = [name.format(nth) for nth in range(1500)]
-    sights = whole([bag_of(*((HERE, [PlacedDetection(label, None)]) for label in labels))])
-    tracemalloc.start()
-    found = estimate(sights, LABELS, go_on=lambda: pytest.fail("compared"))
-    taken_bytes = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert (found.instances, len(found.names)) == ([], 1500)
-    assert taken_bytes < 1024 * 1500
 
 
 @pytest.mark.parametrize(

@@ -10,18 +10,14 @@ from typing import TypeVar
 import pytest
 
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.sights import join_sights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import View
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
-from ros2_memory.things.seen import SightReader
 from tests.support.bags import write_splits
-from tests.support.column_worlds import World
 from tests.support.memories import memory_of, with_store
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked
 
@@ -133,22 +129,3 @@ def test_of_a_window_before_what_was_compared_no_never_is_said(
         assert "published nothing" not in text
         assert "not once" not in text
         assert "no detector reported" not in text or f'" from {begin_of(2)}' in text
-
-
-@pytest.mark.parametrize("apart_s", [0, 3 * 10**8])
-def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
-    tmp_path: Path, apart_s: int
-) -> None:
-    odd = [
-        *looked(0, 10, HERE, ("mug", 3.0, 0.5)),
-        *looked(apart_s + 20, apart_s + 30, HERE, ("cup", 2.0, 0.0)),
-    ]
-    write_splits(tmp_path, odd, split_s=10.0**10)
-    stretches = [
-        one
-        for some in SightReader(View(World.of(tmp_path).memory, Call())).newest_first()
-        for one in some
-    ]
-    parts = [part.packed for stretch in stretches for part in stretch.sights]
-    sections = [0 for stretch in stretches for _ in stretch.sights for _ in stretch.sessions]
-    assert join_sights(parts, sections, sections).labels == ("cup", "mug")

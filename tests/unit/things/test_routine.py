@@ -19,16 +19,6 @@ Drawn: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64
 Whereabouts: TypeAlias = "Callable[[np.random.Generator, int, int, int], int]"
 
 
-def by_routine(chance: np.random.Generator, day: int, hour: int, _: int) -> int:
-    """Mornings, working days and evenings have their places; a tenth of all hours have another."""
-    if chance.random() < 0.1:
-        return int(chance.integers(len(PLACES)))
-    if hour < 9:
-        return 3 if hour < 7 else 0
-    at_work = 2 if day % 7 >= 5 else 1
-    return at_work if hour < 17 else 2
-
-
 def at_random(chance: np.random.Generator, _day: int, _hour: int, before: int) -> int:
     return int(chance.integers(len(PLACES))) if chance.random() < 0.15 else before
 
@@ -63,12 +53,3 @@ def test_without_a_routine_none_is_told(whereabouts: Whereabouts) -> None:
     """One of twenty may be found by chance."""
     found = [told(month(seed, whereabouts), DAYS * DAY) for seed in range(20)]
     assert sum(bool(each) for each in found) <= 1
-
-
-def test_of_few_days_or_of_one_place_nothing_is_said() -> None:
-    drawn = month(2, by_routine)
-    assert told(drawn, 3 * DAY) is None
-    times, seen, _ = drawn
-    assert (
-        usual_places(times, np.broadcast_to(seen[0], seen.shape), DAYS * DAY, lambda _: 0) is None
-    )
