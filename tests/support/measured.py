@@ -63,7 +63,6 @@ UNMEASURED: Final = (
     "test_standstills.py",
     "test_storage_limits.py",
     "test_thinned_moments.py",
-    "test_unknown_time.py",
     "test_unlike_robots.py",
     "test_visits.py",
     "things/test_compare.py",
