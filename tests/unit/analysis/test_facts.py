@@ -1,14 +1,23 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.facts import (
+    BATTERY,
+    CHARGE,
+    COMMAND,
     FLAG,
     LABEL,
     State,
     Word,
+    charge_levels,
+    is_still,
+    state_of,
     stated_by,
 )
 from ros2_memory.analysis.topic_events import (
@@ -18,6 +27,7 @@ from ros2_memory.analysis.topic_events import (
     events_of,
     joined_events,
 )
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 
 
@@ -46,3 +56,26 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     assert events.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14
     assert events.left_out == (15 - 10) + (flips - 10) + (15 - 10)
+
+
+numbers = st.sampled_from(
+    [0.0, -0.0, 1e-5, 0.04, 0.051, 0.21, 0.15, 0.3, 1.0, 1.02, 80.0, -2.0, math.nan, math.inf]
+)
+
+
+def stated(value: JsonValue, type_name: str) -> dict[Word, float]:
+    """The facts of a message, without the NaN of those that have no value."""
+    facts = state_of(value, type_name).facts
+    return {word: 0 if math.isnan(value) else value for word, value in facts}
+
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+@given(st.lists(numbers, max_size=8))
+def test_values_of_columns_are_those_of_the_messages(rows: list[float]) -> None:
+    column = np.array(rows, np.float64)
+    charges = [stated({"percentage": number}, BATTERY).get(Word(CHARGE), -1) for number in rows]
+    assert charge_levels(column).tolist() == charges
+    commands = [stated({"linear": {"x": number}}, TWIST)[Word(COMMAND)] for number in rows]
+    assert (~is_still(column)).tolist() == commands

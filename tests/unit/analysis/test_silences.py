@@ -3,14 +3,19 @@ from itertools import count
 from typing import NamedTuple
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
+    SHORTEST_NS,
     Pacing,
     Silence,
     Spacing,
+    joined_pacings,
     silences,
     usual_periods,
 )
+from ros2_memory.core.spans import united
 
 S = 10**9
 MINUTE, HOUR = 60 * S, 3600 * S
@@ -85,3 +90,25 @@ def test_a_topic_is_silent_while_others_are_heard(
     odom: Activity, seen: Activity, expected: tuple[int, int, int] | None
 ) -> None:
     assert found(odom, seen) == ([] if expected is None else [Silence(SEEN, *expected)])
+
+
+RUNS = st.lists(st.tuples(st.integers(0, 400), st.integers(1, 60)), min_size=1, max_size=12)
+
+
+def all_of(parts: Sequence[Activity]) -> Activity:
+    runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
+    return Activity(runs, joined_pacings([part.pacing for part in parts]))
+
+
+@given(RUNS, RUNS)
+def test_a_silence_lies_between_messages_while_others_are_heard(
+    drawn: list[tuple[int, int]], others: list[tuple[int, int]]
+) -> None:
+    seen = all_of([heard((a * S, (a + n) * S)) for a, n in drawn])
+    odom = all_of([heard((a * S, (a + n) * S)) for a, n in others])
+    for each in found(odom, seen):
+        own, other = (seen, odom) if each.topic == SEEN else (odom, seen)
+        assert all(last <= each.start or first >= each.end for first, last in own.runs)
+        on = [max(0, min(b, each.end) - max(a, each.start)) for a, b in other.runs]
+        # Runs that are half a minute apart count as one.
+        assert 30 * S < each.length <= sum(on) + 30 * S * (len(on) + 1)

@@ -1,6 +1,9 @@
 """The reader of a bag directory: what counts elsewhere is left out, the rest is as in the files."""
 
+import random
 from pathlib import Path
+
+import pytest
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -9,6 +12,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of
 
 T0 = 1_700_000_000 * 10**9
@@ -64,3 +68,44 @@ def test_every_message_is_read_where_counts_are_compared_with_the_files(tmp_path
     reader = BagDirReader(McapReader(), tmp_path, every_message=True)
     assert reader.summarize(old).count == 20
     assert len(list(reader.records(old, ["/bumper"], TimeWindow.everything()))) == 20
+
+
+@pytest.mark.parametrize("seed", range(examples(40)))
+def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+
+    def moment() -> int:
+        return T0 + draw.randrange(examples(40)) * S // 4
+
+    def message(topic: str) -> Msg:
+        at = moment()
+        body = boolean(at, data=True) if draw.random() < 0.7 else text(at, "also of this name")
+        return Msg(topic, body.type, at, body.body, at - draw.randrange(-2, 3) * S // 4)
+
+    messages = [message(draw.choice(["/bumper", "/other"])) for _ in range(60)]
+    layout = McapLayout(chunk_size=draw.choice([200, 1000, 1 << 20]))
+    bag = write_mcap(tmp_path / "a" / "a_0.mcap", messages, layout)
+
+    def overlap() -> Overlap:
+        start, stop = sorted((moment(), moment()))
+        return Overlap(draw.choice([None, start]), draw.choice([None, stop]), ("a_0.mcap",))
+
+    write_handover(
+        tmp_path / "a",
+        Handover(
+            previous="z",
+            counts_from=draw.choice([None, moment(), moment()]),
+            begin=overlap(),
+            next="b",
+            counts_until=draw.choice([None, moment(), moment()]),
+            end=overlap(),
+        ),
+    )
+    reader = BagDirReader(McapReader())
+    found: dict[tuple[str, str], list[int]] = {}
+    for record in reader.records(bag, ["/bumper", "/other"], TimeWindow.everything()):
+        found.setdefault((record.channel.topic, record.channel.type), []).append(record.log_time)
+    assert {
+        (each.topic, each.type): (each.count, each.first, each.last)
+        for each in reader.summarize(bag).topics
+    } == {key: (len(times), times[0], times[-1]) for key, times in found.items()}

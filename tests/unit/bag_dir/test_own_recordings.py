@@ -3,6 +3,7 @@
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.fakes import broken
+from tests.support.fakes import broken, failing
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import embedding, lines, own_all
 from tests.support.log_lines import with_checks
@@ -161,6 +162,29 @@ class TestWhatAKillLeaves:
             own.note_splits(A, {f"{A}_{number}.mcap" for number in range(splits)})
         (tmp_path / B).mkdir()  # by the child; then the power goes
         assert claimed(tmp_path).owns(tmp_path / B)
+
+    def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
+        own = claimed(tmp_path)
+        own.begin(A)
+        (tmp_path / "old").mkdir()
+        old = identity_of(tmp_path / "old")
+        assert old
+        locked = OwnRecordings._locked
+
+        def adopting_first(self: OwnRecordings) -> AbstractContextManager[int | None]:
+            if self is own:  # another program has the lock, so this one waits
+                OwnRecordings(tmp_path).adopt({"old": old})
+                patch.setattr(own_recordings, "write_durably", failing())
+            return locked(self)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(OwnRecordings, "_locked", adopting_first)
+            with pytest.raises(RecorderError, match="No space left"):
+                own.begin(B)
+        assert own.owns(tmp_path / "old")
 
 
 class TestCopies:

@@ -20,7 +20,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import described, made_moment, own_all
+from tests.support.housekeepers import described, embedding, made_moment, own_all
 from tests.support.program import Program
 from tests.unit.cli.conftest import Forget, columns_in, left, locked
 
@@ -278,3 +278,33 @@ def test_where_metadata_cannot_be_corrected_it_says_so_and_what_to_do(
     assert "rec_0/metadata.yaml still describes what was deleted (it is of version" in output
     assert f"ros2 bag reindex {metadata.parent}" in output
     assert metadata.read_text() == before
+
+
+@pytest.mark.parametrize("deployment", ["query_only", "replay"])
+def test_bags_that_others_record_are_refused(
+    bag_dir: Path, forget: Forget, deployment: str
+) -> None:
+    assert "recorder=none" in forget(2, 0, 100, f"--yes deployment={deployment}").err
+    assert len(bags(bag_dir)) == 4
+
+
+def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
+    exits(2, "forget --yes")
+    assert "--last" in exits(2, "forget --yes --start 0").err
+    assert len(bags(bag_dir)) == 4
+
+
+def test_without_a_list_nothing_goes_before_it_is_adopted(
+    bag_dir: Path, exits: Program, forget: Forget
+) -> None:
+    # What a recorder embeds, a copy without its list embeds as well.
+    shutil.rmtree(bag_dir / ".episodic")
+    name = "rec_20231114T221320Z"
+    path = embedding(bag_dir / name / f"{name}_0.mcap", start=T0 + 200 * NS_PER_S)
+    left(path)
+    shown = forget(1, 190, 300).out
+    assert path.exists()
+    assert f"`ros2-memory adopt {name}` first" in shown
+    exits(0, f"adopt {name}")
+    forget(0, 190, 300)
+    assert not path.exists()

@@ -8,9 +8,12 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.places.local_map import east_north
 from tests.support.bags import battery, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of
 from tests.support.program import Program
@@ -147,3 +150,21 @@ def test_without_the_extra_it_names_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setattr("ros2_memory.bootstrap.find_spec", lambda name: None)
     assert "pip install '.[plot]'" in exits(2, f"plot path {bags} --out {tmp_path}/a.svg").err
+
+
+@given(
+    latitude=st.floats(-80, 80),
+    longitude=st.floats(-180, 180),
+    metres=st.tuples(st.floats(-5000, 5000), st.floats(-5000, 5000)),
+)
+def test_metres_east_and_north_lead_back_to_the_fix(
+    latitude: float, longitude: float, metres: tuple[float, float]
+) -> None:
+    """By the distance along the great circle, of a sphere that is off by 0.6 % at most."""
+    origin = Geodetic(latitude, longitude, 0.0)
+    radius = 6_371_000.0
+    north = latitude + math.degrees(metres[1] / radius)
+    east = longitude + math.degrees(metres[0] / radius / math.cos(math.radians(latitude)))
+    wrapped = (east + 180) % 360 - 180
+    found = east_north(origin, Geodetic(north, wrapped, 0.0))
+    assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3

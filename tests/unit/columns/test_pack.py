@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +24,7 @@ from ros2_memory.columns.steps import (
     RELATIVE,
     Step,
 )
-from ros2_memory.columns.table import Texts, Zone
+from ros2_memory.columns.table import Texts, Zone, may_be_in
 from ros2_memory.columns.zones import Zones
 from tests.support.examples import examples
 
@@ -191,3 +193,56 @@ def zones(draw: st.DrawFn) -> Zone:
         return Zone()
     low, high = sorted((draw(BOUNDS), draw(BOUNDS)))
     return Zone(low, high)
+
+
+@settings(max_examples=examples(300), deadline=None)
+@given(st.one_of(integers, floats))
+def test_zones_are_exact(column: Values) -> None:
+    zone = pack(column, METRES).zone
+    there = [value for value in column.tolist() if not math.isnan(value)]
+    assert zone.least == min(there, default=None)
+    assert zone.greatest == max(there, default=None)
+    assert zone.nulls == len(column) - len(there)
+    assert zone.words is None
+    if zone.nulls in {0, len(column)} and len({*there}) <= 1:
+        assert pack(column, METRES).data == b""
+
+
+@given(st.lists(st.text(max_size=30), max_size=30), st.text(max_size=5))
+def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], text: str) -> None:
+    asked = text.casefold()
+    for padding in ([], [f"{number} " * 900 for number in range(3)]):
+        zone = pack(Texts.of([*values, *padding])).zone
+        if any(asked in value.casefold() for value in values):
+            assert Zones.of([1], [zone]).may_have(asked).all()
+
+
+LIMITS = st.one_of(BOUNDS, st.just(10**400), st.just(-(10**400)))
+
+
+def is_exact(*numbers: float) -> bool:
+    return all(not math.isfinite(number) or abs(number) < 2**53 for number in numbers)
+
+
+@given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
+@example([Zone(0, sys.float_info.max)], 1, "")
+@example([Zone(0, math.inf)], 10**400, "")
+@example([Zone(-math.inf, 0)], -(10**400), "")
+def test_zones_rule_out_what_the_zone_of_each_part_does(
+    given_zones: list[Zone], limit: float, text: str
+) -> None:
+    together = Zones.of(range(1, len(given_zones) + 1), given_zones)
+    for nth, zone in enumerate(given_zones):
+        pairs = [
+            (zone.low <= limit <= zone.high, together.spans(limit)[nth]),
+            (zone.high > limit, together.reaches(limit, above=True)[nth]),
+            (zone.low < limit, together.reaches(limit, above=False)[nth]),
+        ]
+        for alone, among_others in pairs:
+            assert among_others or not alone
+            if is_exact(zone.low, zone.high) and abs(limit) < 2**53:
+                assert among_others == alone
+        words = zone.words
+        assert together.may_have(text)[nth] == (words is None or may_be_in(words, text))
+        may_be_json = words is None or any(may_be_in(words, mark) for mark in "[{")
+        assert together.may_be_json[nth] == may_be_json

@@ -19,12 +19,13 @@ from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.stored import Letters
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import GoneError
+from ros2_memory.columns.zones import PartZones
 from ros2_memory.history.context import Call
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
 from ros2_memory.queries import find_last_match
 from tests.support.bags import Msg, odom, text, write_mcap, write_splits
-from tests.support.column_worlds import EVERYTHING, World, check_rows
+from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
 from tests.support.examples import examples
 from tests.support.memories import asked, assert_same_counts, memory_of
 
@@ -141,3 +142,22 @@ def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
         for tool, given_ in questions(Random(seed)):
             expected = asked(plain, tool, **given_)
             assert_same_counts(asked(started, tool, **given_), expected, of_means=0.02)
+
+
+def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "hello")])
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + S, 0.0, 0.0)])
+    world = World.of(tmp_path)
+    first, second = world.memory.index.snapshot().timeline.bags
+    world.fill_alone([first])
+
+    def may_say(parts: PartZones) -> bool:
+        return "data" in parts.topic.layout.slots
+
+    opened = open_scan(View(world.memory, Call()), "/chatter", EVERYTHING, may_match=may_say)
+    store_file(tmp_path).unlink()
+    world.store.look_after()
+    world.fill_alone([second])  # its topic has the id that the other one had
+    with pytest.raises(GoneError):
+        [*opened.rows()]
+    assert check_rows(world, "/chatter") == check_rows(world, "/odom") == 1

@@ -21,9 +21,11 @@ from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import (
     TruthValues,
+    seconds,
 )
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.model import JsonValue
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES
@@ -347,3 +349,34 @@ def test_columns_state_what_drawn_messages_state(drawn: Drawn) -> None:
             assert read == 0
         for step in (0.0, 1e-6):  # what may be wrong, rounded, is read
             states_compared(stored(drawn.table, step), drawn)
+
+
+STRING = "std_msgs/msg/String"
+
+
+PLAIN = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+    "sensor_msgs/msg/BatteryState",
+    "rcl_interfaces/msg/Log",
+    "px4_msgs/msg/VehicleOdometry",
+    STRING,
+    "std_msgs/msg/Int64",
+    "std_msgs/msg/Float32",
+)
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(drawn_tables(PLAIN), RANDOM)
+def test_truth_is_sure_where_columns_hold_the_whole_value(drawn: Drawn, random: Random) -> None:
+    values = values_of(drawn)
+    for _ in range(4):
+        condition = condition_on(values, random)
+        assert judged(drawn.table, condition, values) == 0
+
+
+@given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
+def test_seconds_are_rounded_as_those_of_each_message(times: list[int]) -> None:
+    found = seconds(np.array(times, np.int64))
+    assert found.tolist() == [unix_from_ns(time) for time in times]

@@ -5,16 +5,22 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, groupby, repeat
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from ros2_memory.analysis.frames import static_at
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.core.timebase import Deadline
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
 from tests.support.bags import Msg, boolean, odom, tf, transform, write_splits
+from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
@@ -246,3 +252,29 @@ def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     assert [note for note in found.notes if "no name" in note and note.endswith("1")]
     refused = looked_up(memory, T0 + 300 * S, "", "base_link")
     assert "ask about then" not in refused["detail"]
+
+
+@settings(max_examples=examples(30))
+@given(
+    received=st.lists(
+        st.tuples(st.sampled_from(["arm", "/arm", "eye"]), st.integers(0, 2)),
+        min_size=1,
+        max_size=12,
+    ),
+    at=st.integers(-1, 13),
+)
+def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repeated(
+    received: list[tuple[str, int]], at: int
+) -> None:
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for nth, (child, x) in enumerate(received):
+            record(folder / "rec", [fixed(T0 + nth * S, "base_link", child, x)], split_s=1)
+        view = View(memory_of(folder), Call())
+        [[session]] = view.sessions.recorded_at(T0) or []
+        found = static_at(view.sessions.static(session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
+    expected: dict[str, float] = {}
+    for second, (child, x) in enumerate(received):
+        if second <= at or child.lstrip("/") not in expected:
+            expected[child.lstrip("/")] = float(x)
+    assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected

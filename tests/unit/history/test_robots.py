@@ -262,3 +262,17 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         visits = asked(memory, "visits", x=35.0, y=0.0, radius_m=1.0)
         assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
         assert any("run has the time from" in note for note in visits["notes"])
+
+
+@pytest.mark.parametrize("resting", [1, 20])
+def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
+    tmp_path: Path, resting: int
+) -> None:
+    for speed in (1.0, 2.0):
+        name, times = f"run_{speed:.0f}", range(S, 61 * S, S)
+        poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
+    memory = memory_of(tmp_path)
+    assert differing(memory) == [(("run_1", "run_2"), "/odom")]
+    told = asked(memory, "trajectory_summary", start=0, end=61)
+    assert told["reason"] == "mixed"

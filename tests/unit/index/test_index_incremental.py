@@ -149,7 +149,7 @@ class World:
                 os.utime(folder, ns=(self.clock.at,) * 2)
 
 
-@settings(max_examples=examples(120))
+@settings(max_examples=examples(300))
 @given(script=st.lists(steps, max_size=40))
 @example(
     script=[

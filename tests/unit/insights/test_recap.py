@@ -4,9 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -32,6 +35,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
+from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
 
@@ -411,3 +415,46 @@ def test_a_goal_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path
     assert (goal["goal"][-1], goal["status"], goal[status]) == ("2", "aborted", 6)
     refused = asked(memory, "find_matches", **aborted, fields=["nope"])
     assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
+
+
+ENDS = st.sampled_from([4, 5, 6])
+
+History = list[tuple[int, Mapping[int, int]]]
+
+
+@settings(max_examples=examples(15))
+@given(
+    st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
+    st.integers(1, 5),
+    st.booleans(),
+)
+def test_however_the_history_is_cut_the_same_is_told(
+    runs: list[tuple[int, int, int]], cut: int, recalls: bool
+) -> None:
+    at, expected, statuses = 5, [], dict[int, int]()
+    messages: History = [(1, {})]
+    words = {4: "succeeded", 5: "canceled", 6: "aborted"}
+    for goal, (pause, length, end) in enumerate(runs):
+        at += pause
+        begun, at = at, at + length
+        statuses = {**statuses, goal: 2}
+        messages.append((begun, statuses))
+        statuses = {**statuses, goal: end}
+        messages.append((at, statuses))
+        expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
+    with TemporaryDirectory() as folder:
+        found = told_goals(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
+        searched = found_in(memory_of(Path(folder), recalls=recalls), "above", 3, "status")
+    assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
+    assert [
+        (f"/drive goal {status} after {end - begin:g} s", begin, end)
+        for _, status, begin, end, _ in reversed(searched)
+    ] == expected
+
+
+def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
+    for end, goes_on in ((15, True), (40, False), (60, False)):
+        events = over(memory_of(tmp_path), 0, end).events
+        assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,9 +16,10 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.visits import visits
-from tests.support.bags import odom, tf, transform, write_splits
+from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap, write_splits
 from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.tables import table
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
@@ -109,3 +111,39 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
             assert known.track.x.max() == 5.0
     assert len(known_since) > 10
     assert None in known_since
+
+
+@pytest.mark.parametrize(
+    ("recalls", "latched"),
+    [(False, ()), (True, ()), (False, ("/odom",))],
+    ids=["plain", "catalogue", "latched"],
+)
+def test_each_of_two_robots_in_a_folder_is_in_its_place(
+    tmp_path: Path, recalls: bool, latched: tuple[str, ...]
+) -> None:
+    """The second one has a track of its own, in every tool that takes a place."""
+    words = [text(BEGIN + n * S, "hello") for n in range(90)]
+    for name, since, x, said in (("left", 0, 0.0, words), ("right", 5, 30.0, [])):
+        poses = [odom(BEGIN + since * S + n * S // 5, x + 9 * (n >= 150), 0.0) for n in range(400)]
+        messages = sorted([*poses, *said], key=lambda message: message.log_time)
+        layout = McapLayout(latched=frozenset(latched))
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
+    hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+
+    def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
+        return table(asked(memory, tool, **given))[row]
+
+    places = asked(memory, "visits")["places"]
+    assert [(row["place"], row["exits"], row["minutes"]) for row in places] == [
+        ("here", 1, 0.5),
+        ("there", 1, 0.5),
+    ]
+    for name, first in (("here", 0), ("there", 5)):
+        seen = asked(memory, "visits", where=name)
+        assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
+        assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
+        [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
+        assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
+        assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8

@@ -1,5 +1,6 @@
 """The folder `memory/`: what stays of bags that retention deletes."""
 
+import errno
 import json
 import operator
 import shutil
@@ -24,6 +25,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, THINNED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
+    SUPERSEDED,
     THINNED,
     Thinned,
     read_superseded,
@@ -931,3 +933,27 @@ def test_days_whose_bags_nobody_looked_at_say_so(blind: Path) -> None:
     notes = reply_over(blind, "data_time_range")["notes"]
     [said] = [each for each in notes if "memory/ before" in each]
     assert said.endswith("are not known")
+
+
+def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(bag_dir: Path) -> None:
+    days = days_of(bag_dir)
+    for name, second in (("rec_A", 0), ("rec_B", 7200)):
+        split(bag_dir, second, name=name)
+    keep_all(bag_dir, days=days)
+    with broken(SUPERSEDED, "read", errno.EMFILE), pytest.raises(OSError, match="Too many"):
+        keep_all(bag_dir, "rec_B", days=days)
+    keep_all(bag_dir, "rec_B", days=days)
+    assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
+
+
+@pytest.mark.parametrize("after", [0, 50])
+def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
+    split(bag_dir, 0)
+    keep_all(bag_dir)
+    before = (bag_dir / DAY_FILE).read_bytes()
+    split(bag_dir, 60, name="rec_B")
+    with pytest.raises(BagError):
+        keep_all(bag_dir, "rec_B", writer=Failing(after))
+    assert (bag_dir / DAY_FILE).read_bytes() == before
+    left = sorted(path.name for path in (bag_dir / "memory").iterdir())
+    assert left == ["20260921.thinned.mcap", "thinned.json"]

@@ -1,6 +1,6 @@
 import errno
 import threading
-from collections.abc import MutableMapping
+from collections.abc import Iterable, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,14 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import (
     DELETED,
+    Loss,
     Receipt,
+    append_losses,
     append_receipts,
     read_losses,
 )
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.recorder import housekeeping
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
@@ -159,6 +162,21 @@ class TestRetention:
         bag(tmp_path / "b/b_0.mcap", 100)
         keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
         assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
+
+    def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(
+        self, tmp_path: Path
+    ) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        left_open(tmp_path / "b" / "b_0.mcap", 100)
+        for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
+            (tmp_path / name).parent.mkdir()
+            (tmp_path / name).write_bytes(bytes(5000))
+        recording_now(tmp_path, "b")
+        total = size_of(tmp_path)
+        keeper_of(tmp_path, max_bytes=total).apply()
+        assert first.exists()
+        keeper_of(tmp_path, max_bytes=total - 1).apply()
+        assert not first.exists()
 
 
 class TestWhatIsNeverDeleted:
@@ -396,3 +414,32 @@ def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> N
     assert reported["path"] == str(damaged)
     assert "first 5 bytes" in reported["reason"]
     assert damaged.read_bytes() == b"\x89MCAP"
+
+
+def test_an_interruption_that_comes_while_another_is_written_is_written_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeper = keeper_of(tmp_path, clock=later(0))
+    paused = threading.Thread(target=keeper.note_restart, args=(T0, "paused"))
+    lock, waits = threading.Lock(), threading.Event()
+
+    class WatchedLock:
+        def __enter__(self) -> None:
+            if threading.current_thread() is paused:
+                waits.set()
+            lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            lock.release()
+
+    def slow(bag_dir: Path, losses: Iterable[Loss]) -> None:
+        append_losses(bag_dir, losses)
+        if not paused.ident:
+            paused.start()
+            assert waits.wait(60)
+
+    monkeypatch.setattr(keeper, "_lock", WatchedLock())
+    monkeypatch.setattr(housekeeping, "append_losses", slow)
+    keeper.note_restart(T0, "died")
+    paused.join()
+    assert [loss.by for loss in read_losses(tmp_path, 0, MAX_NS)] == ["died", "paused"]

@@ -18,6 +18,7 @@ from ros2_memory.bag_dir.layout import LOST_FILE
 from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.recorder import sessions
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.sessions import SplitChanges, Splits
 from ros2_memory.recorder.supervisor import make_bag_dir
@@ -26,7 +27,13 @@ from tests.support import simulated_recorders
 from tests.support.bags import odom
 from tests.support.fakes import broken
 from tests.support.housekeepers import keeper_of
-from tests.support.simulated_recorders import World, assert_each_counts_once, events, rotating
+from tests.support.simulated_recorders import (
+    World,
+    assert_each_counts_once,
+    assert_what_stands_counts_once,
+    events,
+    rotating,
+)
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
@@ -81,6 +88,37 @@ class TestDeath:
         world.recorders[0].die()
         world.run(0.5)
         assert not world.recorders[0].directory.exists()
+
+    def test_a_new_one_that_dies_in_a_handover_counts_for_nothing(self, tmp_path: Path) -> None:
+        world = rotating(tmp_path, 22.5)
+        old, new = world.recorders
+        new.die()
+        with capture_logs() as logs:
+            world.run(1)
+        assert (len(events(logs, "recorder_died")), events(logs, "recorder_hung")) == (1, [])
+        assert world.heartbeat()["restarts"] == 1
+        assert old.status is None
+        assert read_handover(new.directory).handover.hides_all
+        assert read_handover(old.directory).handover.next is None
+        world.run(15)
+        assert len(world.recorders) == 3
+        assert_each_counts_once(world)
+
+    def test_where_the_disk_does_not_list_what_is_there_it_is_settled_later(
+        self, tmp_path: Path
+    ) -> None:
+        world = rotating(tmp_path, 24)
+        for recorder in world.running:
+            recorder.die()
+        again = World(tmp_path)
+        again.wall = world.wall + NS_PER_S
+        with broken(sessions, "unsettled_handovers", errno.EIO), capture_logs() as logs:
+            again.started(3)
+        assert again.supervisor.is_recording
+        assert [each["task"] for each in events(logs, "supervision_failed")] == ["settle"]
+        again.run(60)
+        again.supervisor.stop()
+        assert_what_stands_counts_once(world)
 
 
 class TestFailingDisk:

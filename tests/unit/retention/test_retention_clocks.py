@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import RECORDED_FILE
-from ros2_memory.core.timebase import FUTURE_NS
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
@@ -250,3 +250,40 @@ def test_where_the_clock_was_always_right_age_deletes_by_dates_whatever_was_rest
             expected = too_old_by_dates(life.bags, life.wall, AGE)
             assert {bag.path for bag in aged} == expected
             life.delete(aged)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 9), st.booleans(), st.integers(0, 60), st.booleans()),
+        min_size=1,
+        max_size=40,
+    ),
+    st.integers(1, 40),
+)
+def test_a_clock_that_was_behind_ages_nothing_young(
+    drawn: list[tuple[int, bool, int, bool]], limit_days: int
+) -> None:
+    """It recorded without a pause; the dates of a clock that was behind are doubtful."""
+    limits, now = RetentionLimits(PLENTY, limit_days * DAY), T0
+    bags, true_ends, doubtful = list[StoredBag](), dict[str, int](), set[str]()
+    for nth, (off_days, is_behind, by_days, is_empty) in enumerate(drawn):
+        now += off_days * DAY
+        end = now - by_days * DAY if is_behind else now
+        span = (MAX_NS, MIN_NS) if is_empty and bags else (end - S, end)
+        bags.append(bag(f"rec_{nth}", nth, *span)._replace(written=end))
+        true_ends[bags[-1].path] = now
+        if is_behind:
+            doubtful.add(bags[-1].recording)
+    places = {each.recording: place for place, each in enumerate(bags)}
+    contents = DirContents(
+        bags,
+        now,
+        places=places,
+        synchronised=True,
+        recorded_since={each.recording: now - true_ends[each.path] for each in bags},
+        doubtful=frozenset(doubtful),
+    )
+    aged = set(expired(contents, limits))
+    old = {each for each in bags if now - true_ends[each.path] > limits.max_age_ns}
+    assert aged <= old
+    assert len({each for each in old if each.recording in doubtful} - aged) <= 1, "the newest stays"

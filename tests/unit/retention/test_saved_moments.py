@@ -124,6 +124,17 @@ class TestKeeping:
         assert "symbolic link" in str(refused)
         assert files_in(tmp_path / "else") == []
 
+    def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        house, moments = house_of(tmp_path), tmp_path / "moments"
+        with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
+            outcome = kept(house, tmp_path, 15, 25)
+        assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
+        assert not list(stored_moments_in(tmp_path))
+        assert lines(tmp_path) == []
+
 
 def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
     """Two splits, and a moment that goes on for 6 s longer."""

@@ -20,7 +20,10 @@ from structlog.testing import LogCapture
 from ros2_memory import results
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
+    EpisodicError,
     InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
     QueryTimeoutError,
 )
 from ros2_memory.core.large_reads import LargeReads
@@ -31,7 +34,7 @@ from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispat
 from ros2_memory.serving.fair_queue import MOST_WAITING, FairQueue
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.replies import Replies, Reply
 
 NOBODY = cast("Memory", SimpleNamespace(large=LargeReads()))
 """The tools of these tests ask nothing of a memory."""
@@ -339,3 +342,21 @@ async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -
     held.released.set()
     assert await following == 2
     await until(lambda: queue.running == 0)
+
+
+class BrokenReplies(Replies):
+    def error(self, error: EpisodicError) -> Reply:
+        raise KeyError("secret")
+
+
+@pytest.mark.parametrize("given", [{}, {"bad": 1}])
+async def test_a_fault_in_telling_an_error_is_told_as_any_other(
+    given: dict[str, Any], log: LogCapture
+) -> None:
+    tools = [tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))]
+    replies = BrokenReplies(Path("bags"), 24_000)
+    reply = await Dispatcher(NOBODY, tools, replies, call_timeout_s=25).answer("none", given)
+    assert reply.is_error
+    assert json.loads(reply.text)["error"] == "internal"
+    assert "secret" not in reply.text
+    assert [entry["event"] for entry in log.entries] == ["tool_failed", "tool_call"]

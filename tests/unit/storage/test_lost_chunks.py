@@ -22,6 +22,8 @@ from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
 from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.mcap.bulk import ReadChunks
+from ros2_memory.storage.mcap.chunk import MessageTable
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
@@ -272,3 +274,10 @@ def test_a_clock_that_goes_back_does_so_as_far_however_the_file_is_cut(
     by, at = tally.contents().set_back
     assert by == max(np.maximum.accumulate(times) - times)
     assert by == 0 or at in times
+
+
+def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
+    content = ReadChunks((), bytes(200), [100, 100])
+    messages = MessageTable(*np.array([[1], [0], [2**63 - 1], [1]]))
+    with pytest.raises(UnreadableError, match="a message is not where its index says"):
+        bulk.message_heads(content, messages)

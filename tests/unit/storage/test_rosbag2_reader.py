@@ -256,3 +256,27 @@ def _block_starts(data: bytes) -> list[int]:
         last = bool(header & 1)
         at += 3 + (1 if header >> 1 & 3 == 1 else header >> 3)
     return [*starts, at]
+
+
+STRING = "std_msgs/msg/String"
+
+
+def test_the_bag_of_2018_has_no_format_column_short_type_names_and_no_index(tmp_path: Path) -> None:
+    hello = text(0, "hello").payload.hex()
+    path = change(
+        tmp_path / "old.db3",
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL)",
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
+        "timestamp INTEGER NOT NULL, data BLOB NOT NULL)",
+        "INSERT INTO topics VALUES (1, '/chatter', 'std_msgs/String')",
+        *(
+            f"INSERT INTO messages VALUES (NULL, 1, {at}, x'{hello}')"  # noqa: S608
+            for at in (3, 1, 2, 1)
+        ),
+    )
+    reader = Rosbag2Reader()
+    (topic,) = reader.summarize(path).topics
+    assert (topic.type, topic.encoding, topic.count, topic.latched) == (STRING, "cdr", 4, False)
+    records = read(reader, path)
+    assert times(records) == [1, 1, 2, 3]
+    assert getattr(reader.decode(records[0]), "data", "") == "hello"

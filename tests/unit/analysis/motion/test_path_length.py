@@ -1,6 +1,8 @@
 """How far, how fast and where a robot drove, by poses with noise, gaps, resets and turns."""
 
+import math
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -115,3 +117,15 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     times = [each.time for each in found.waypoints]
     assert times == sorted(set(times))
     assert (times[0], times[-1]) == (poses.times[0], poses.times[-1])
+
+
+elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
+
+
+@given(st.lists(elsewhere, min_size=2, max_size=15))
+def test_of_few_poses_the_distance_is_the_plain_length(positions: list[Vector3]) -> None:
+    found = way_of(driven(positions), 1e9).trajectory()
+    length_m = math.fsum(math.dist(a, b) for a, b in pairwise(positions))
+    assert found.totals.distance_m == pytest.approx(length_m, rel=1e-12)
+    assert found.totals.jumps == 0
+    assert (found.max_speed or 0) >= (found.avg_speed or 0) >= 0

@@ -1,17 +1,27 @@
 """The track of the robot: few vertices, and near every pose at its time."""
 
 import math
+from itertools import pairwise
 from random import Random
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
     TOLERANCE_RAD,
+    PartialTrack,
     RobotTrack,
+    joined_tracks,
+    partial_track,
+    settled_tracks,
+    slot_ends,
+    track_by,
     track_of,
 )
+from tests.support.examples import examples
 
 MS = 10**6
 S = 10**9
@@ -57,3 +67,36 @@ def test_every_pose_is_near_the_track_at_its_time(seed: int) -> None:
     assert np.abs(off).max() <= TOLERANCE_RAD + 0.05
     assert {*track.times.tolist()} <= {*rows[0]}
     assert len(track.times) < len(times) / 3
+
+
+def same(one: RobotTrack, other: RobotTrack) -> bool:
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=name == "heading")
+        for name in ("times", "x", "y", "heading", "begins")
+    )
+
+
+@settings(max_examples=examples(40), deadline=None)
+@given(
+    seed=st.integers(0, 999), cuts=st.lists(st.integers(1, 1499), max_size=6), thins=st.booleans()
+)
+def test_a_track_does_not_depend_on_how_its_poses_are_cut(
+    seed: int, cuts: list[int], thins: bool
+) -> None:
+    columns = [np.array(column) for column in driven(seed)]
+
+    def part(begin: int, end: int) -> PartialTrack:
+        some = [column[begin:end] for column in columns]
+        if thins:
+            index = slot_ends(some[0])
+            some = [column[index] for column in some]
+        times, x, y, heading = some
+        return partial_track(times, x, y, heading)
+
+    whole = track_by(*joined_tracks([[part(0, 1500)]]))
+    parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
+    assert same(track_by(*joined_tracks([parts])), whole)
+    assert same(track_by(*joined_tracks([parts[::-1]])), whole)
+    middle = len(parts) // 2
+    stretches = [*settled_tracks(parts[:middle]), *settled_tracks(parts[middle:])]
+    assert same(track_by(*joined_tracks([stretches])), whole)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.standstills import (
+    DROP_SLOT_NS,
     SpeedDrop,
     Standstill,
     speed_drops,
@@ -213,3 +214,25 @@ def found(poses: list[Pose]) -> list[SpeedDrop]:
 )
 def test_what_is_no_sudden_loss_of_speed(poses: list[Pose]) -> None:
     assert found(poses) == []
+
+
+@given(
+    legs=st.lists(
+        st.tuples(
+            st.floats(0.3, 6), st.sampled_from([0.0, 0.05, 0.2, 0.5]), st.sampled_from([0.0, 0.5])
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    blocks=st.integers(1, 8),
+    silent=st.booleans(),
+)
+def test_slices_of_any_length_change_no_drop(
+    legs: list[tuple[float, float, float]], blocks: int, silent: bool
+) -> None:
+    poses = driven(*legs, rate=10)
+    if silent:
+        poses = [each for each in poses if (each[0] - BEGIN) // DROP_SLOT_NS % 17 > 1]
+    rows = [(at, place) for at, place, _ in poses]
+    turned = posed(rows, [turn for *_, turn in poses])
+    assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]

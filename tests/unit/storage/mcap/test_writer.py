@@ -145,3 +145,12 @@ def test_a_copy_has_no_more_chunks_than_are_read(
     assert McapWriter().rewrite(source, tmp_path / "b.mcap").messages == 60
     assert not McapWriter().cut(source, tmp_path / "c.mcap", lambda *_: False)
     assert contents(tmp_path / "b.mcap") == contents(tmp_path / "c.mcap") == contents(source)
+
+
+def test_a_file_of_the_targets_name_is_not_overwritten(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "a.mcap", messages())
+    target = tmp_path / "b.mcap"
+    target.write_bytes(b"somebody's")
+    with pytest.raises(BagError, match="File exists"):
+        McapWriter().rewrite(source, target)
+    assert target.read_bytes() == b"somebody's"
