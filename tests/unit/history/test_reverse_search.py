@@ -238,3 +238,9 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     reply = asked(memory_of(tmp_path), "find_matches", **wash)
     assert len(reply["sightings"]) == 4
     assert any("may have held for longer" in note for note in reply["notes"])
+
+
+def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    assert at(last(memory, "contains", "scissors")) == 1
+    assert reader.names == ["rec_0.mcap"]
