@@ -304,7 +304,7 @@ class _Paper:
             if _is_missing(answer):
                 return f"{len(inner)} messages match" if inner else None
             found = answer["sightings"]
-            if answer["total"] is None or answer["total"] > len(found):
+            if answer.get("more"):
                 return None
             total = sum(each["count"] for each in found)
             if not len(inner) <= total <= len(outer):
