@@ -264,14 +264,19 @@ def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_pat
         assert (at["in"], at["also_in"]) == ("pen", ["yard"])
 
 
-def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_is_known(
-    tmp_path: Path,
-) -> None:
+def in_the_map_at_first(bag_dir: Path) -> Memory:
+    """A robot that drives for a minute, of which transforms lead to the map for 20 s."""
     messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
     messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
     messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
-    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
-    memory = memory_of(tmp_path)
+    write_mcap(bag_dir / "r" / "r_0.mcap", messages)
+    return memory_of(bag_dir)
+
+
+def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_is_known(
+    tmp_path: Path,
+) -> None:
+    memory = in_the_map_at_first(tmp_path)
     later = {"start": T0_S + 40, "end": T0_S + 59}
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 50}),
@@ -290,11 +295,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
 def test_a_match_stays_where_the_robot_is_not_known_in_the_frame_that_was_asked_for(
     tmp_path: Path,
 ) -> None:
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
-    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
-    messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
-    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
-    memory = memory_of(tmp_path)
+    memory = in_the_map_at_first(tmp_path)
     said = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
     answer = asked(memory, "find_matches", frame_id="map", **said)
     newest, oldest = answer["sightings"]

@@ -26,7 +26,7 @@ from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
     Overlapping,
-    mingled_bags,
+    loose_bags_beside_others,
     overlapping_recordings,
     recordings_of,
 )
@@ -436,7 +436,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
     steps = _steps_back(view)
     loose_files: dict[str, list[str]] = defaultdict(list)
-    for file, recording in mingled_bags(view.snapshot).items():
+    for file, recording in loose_bags_beside_others(view.snapshot).items():
         loose_files[recording].append(file)
     going_on: list[_TopicSpan] = []
     for later in sorted(spans):
@@ -459,19 +459,19 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
 
 def _recordings_with(view: View, topic: str) -> dict[Path, Span]:
     """Returns the recordings that hold a topic, with its first and last log time in each."""
-    mingled = mingled_bags(view.snapshot)
-    if not mingled:
+    loose = loose_bags_beside_others(view.snapshot)
+    if not loose:
         return dict(view.timeline.recordings(topic))
     recordings: dict[Path, Span] = {}
     for bag, first, last in view.timeline.extents(topic, TimeWindow.everything()):
-        path = _recording_of(bag, mingled)
+        path = _recording_of(bag, loose)
         recordings[path] = wider(recordings.get(path), (first, last))
     return recordings
 
 
-def _recording_of(bag: BagFile, mingled: Mapping[str, str]) -> Path:
-    """Returns the recording of a bag: its folder, unless it is among the `mingled_bags`."""
-    return Path(mingled[bag.file]) if bag.file in mingled else bag.recording
+def _recording_of(bag: BagFile, loose: Mapping[str, str]) -> Path:
+    """Returns the recording of a bag: its folder, unless `loose` has another by its path."""
+    return Path(loose[bag.file]) if bag.file in loose else bag.recording
 
 
 def _has_bags_near(view: View, topic: str, recording: Path, span: TimeWindow) -> bool:
@@ -522,7 +522,7 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
     steps: dict[Path, Ns] = defaultdict(int)
     for fault in view.snapshot.dating.faults:
         if fault.kind is FaultyClock.SET_BACK:
-            recording = _recording_of(fault.bag, mingled_bags(view.snapshot))
+            recording = _recording_of(fault.bag, loose_bags_beside_others(view.snapshot))
             steps[recording] = max(fault.by, steps[recording])
     return steps
 
@@ -536,9 +536,9 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
         return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
-    mingled = mingled_bags(view.snapshot)
+    loose = loose_bags_beside_others(view.snapshot)
     first, other = (
-        [extent for extent in near if _recording_of(extent.bag, mingled) == path] for path in pair
+        [extent for extent in near if _recording_of(extent.bag, loose) == path] for path in pair
     )
     differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time

@@ -46,8 +46,8 @@ _MAX_READ: Final = 200
 """How many pairs are checked for a handover; each check reads two files."""
 _OVERLAPS: Final[Key[tuple[Overlapping, ...]]] = Key()
 """Of a timeline: the pairs that overlap for long, including handovers."""
-_MINGLED: Final[Key[dict[tuple[str, ...], dict[str, str]]]] = Key()
-"""Of a timeline: `mingled_bags`, by the folders with a metadata.yaml."""
+_BESIDE_OTHERS: Final[Key[dict[tuple[str, ...], dict[str, str]]]] = Key()
+"""Of a timeline: `loose_bags_beside_others`, by the folders with a metadata.yaml."""
 
 
 def paths_named(path: str) -> re.Pattern[str]:
@@ -125,15 +125,15 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     return recordings
 
 
-def mingled_bags(snapshot: Snapshot) -> dict[str, str]:
+def loose_bags_beside_others(snapshot: Snapshot) -> dict[str, str]:
     """Returns by path the recording of each loose bag beside bags of another recording."""
-    known, folders = snapshot.timeline.memo.of(_MINGLED, dict), snapshot.metadata_folders
+    known, folders = snapshot.timeline.memo.of(_BESIDE_OTHERS, dict), snapshot.metadata_folders
     if folders not in known:
-        known[folders] = _find_mingled(snapshot)
+        known[folders] = _find_beside_others(snapshot)
     return known[folders]
 
 
-def _find_mingled(snapshot: Snapshot) -> dict[str, str]:
+def _find_beside_others(snapshot: Snapshot) -> dict[str, str]:
     loose = loose_bags(snapshot)
     if not loose:
         return loose

@@ -44,6 +44,13 @@ def world(tmp_path: Path) -> World:
     return World(tmp_path).started(3)
 
 
+def splits_to_come(world: World) -> list[Path]:
+    """Two splits that the recorder, after its first ones, has still to write."""
+    world.run(10)
+    directory = world.recorders[0].directory
+    return [directory / f"{directory.name}_{number}.mcap" for number in (4, 5)]
+
+
 class TestDeath:
     def test_waits_grow_until_a_good_split_was_written(self, tmp_path: Path) -> None:
         world = World(tmp_path, split_duration_s=100).started()
@@ -192,9 +199,7 @@ class TestFailingDisk:
     def test_each_split_that_cannot_be_read_is_named_once_until_it_can_be(
         self, world: World
     ) -> None:
-        world.run(10)
-        directory = world.recorders[0].directory
-        unread = [directory / f"{directory.name}_{number}.mcap" for number in (4, 5)]
+        unread = splits_to_come(world)
 
         def named_meanwhile(*paths: Path) -> list[str]:
             with broken(world.reader, "closing", errno.EACCES, where=lambda path: path in paths):
@@ -207,9 +212,7 @@ class TestFailingDisk:
     def test_the_heartbeat_has_recovered_when_no_split_is_unreadable_any_more(
         self, world: World
     ) -> None:
-        world.run(10)
-        directory = world.recorders[0].directory
-        unread = [directory / f"{directory.name}_{number}.mcap" for number in (4, 5)]
+        unread = splits_to_come(world)
         for paths, fault in ((unread, unread[1]), (unread[:1], unread[0])):
             with broken(world.reader, "closing", errno.EACCES, where=paths.__contains__):
                 world.run(20)
