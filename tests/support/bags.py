@@ -56,7 +56,8 @@ OTHER_ROBOTS: Final = {
     "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
     "geographic_msgs/msg/GeoPointStamped": "std_msgs/Header header\nGeoPoint position\n",
     "winch_msgs/msg/Winch": (
-        "int8 STATE_IDLE=0\nint8 STATE_HAULING=2\nint8 state\nfloat32 cable\nstring note\n"
+        "int8 STATE_IDLE=0\nint8 STATE_HAULING=2\nfloat32 CABLE_LONGEST=1.5\n"
+        "int8 state\nfloat32 cable\nstring note\n"
     ),
     "px4_msgs/msg/VehicleStatus": (
         "uint64 timestamp\nuint8 arming_state\n"

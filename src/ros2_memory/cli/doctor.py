@@ -484,16 +484,16 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         return
     try:
         location = lake_location(settings)
-        committed = location.last_commit()
+        changed = location.last_change()
     except (ConfigError, LakeError) as problem:
         do = "correct lake.warehouse, lake.uri or what leads there; nothing is lost meanwhile"
         yield error(str(problem), do)
         return
-    if committed is None:
+    if changed is None:
         do = "ros2-memory ship makes it; was it there before, is its disk mounted?"
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
-        yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
+        yield ok(f"{location.warehouse}; its bags last changed {iso_local(changed)}")
     if settings.lake.engine is not None:  # this server only asks the lake
         return
     for name, bag_dir in settings.fleet.robots.items():

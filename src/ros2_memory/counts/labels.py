@@ -290,10 +290,12 @@ def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock
     times, detections = detected.log_times, detected.found
     labels = detections.labels.words
     rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+    pairs, sizes = np.unique(rows * max(len(labels), 1) + codes, return_counts=True)
+    most_of_codes = np.zeros(len(labels), np.int64)
+    np.maximum.at(most_of_codes, pairs % max(len(labels), 1), sizes)
     most_at_once = Counter[str]()
-    pairs, sizes = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
-    for code, size in zip(pairs[1].tolist(), sizes.tolist(), strict=True):
-        most_at_once[labels[code]] = max(most_at_once[labels[code]], size)
+    for label, most in zip(labels, most_of_codes.tolist(), strict=True):
+        most_at_once[label] = max(most_at_once[label], most)
     visible = visible_in(times, rows, codes, detections.scores[counts], labels)
     return _SeenBlock(
         source,

@@ -252,6 +252,8 @@ class BagAccess:
         key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         cached = cache.get(key) if is_lasting else None
+        to_cache: list[list[Table]] | None = [] if is_lasting and cached is None else None
+        size = 0
         groups: Iterator[list[Table]]
         if cached is None:
             read_now = undecoded(
@@ -264,15 +266,13 @@ class BagAccess:
             )
             groups = map(Group.tables, read_now)
         else:
-            groups, is_lasting = iter(cached), False
-        read: list[list[Table]] = []
-        size = 0
+            groups = iter(cached)
         while True:
             try:
                 with self.call.stages.timed("read"):
                     tables = next(groups, None)
             except BagError as error:
-                is_lasting = False  # each answer has to note what is lost
+                to_cache = None  # each answer has to note what is lost
                 self._note_unreadable(bag, error, window)
                 if error.lost is None:
                     return
@@ -280,13 +280,14 @@ class BagAccess:
             if tables is None:
                 break
             self._track_source(bag)
-            size += 1000 + sum(table.memory_bytes for table in tables)
-            if size <= DECODED_BYTES:
-                read.append(tables)
+            if to_cache is not None:
+                to_cache.append(tables)
+                size += 1000 + sum(table.memory_bytes for table in tables)
+                to_cache = to_cache if size <= DECODED_BYTES else None
             yield from tables
             self.check_deadline()
-        if is_lasting and size <= DECODED_BYTES:
-            cache.put(key, read, size)
+        if to_cache is not None:
+            cache.put(key, to_cache, size)
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.columns.store import relative
@@ -392,10 +392,6 @@ class Latching:
         return None if snapshot.timeline.is_transient_state(topic) else False
 
 
-NoteKey: TypeAlias = "tuple[Reason, str, Ns, Ns]"
-"""Kind, file, since and until of a note."""
-
-
 class Note(NamedTuple):
     """What is wrong with one file, topic or recording. Notes of one kind make one sentence.
 
@@ -427,7 +423,7 @@ class Notes:
         self.complete = True
         self.added = 0
         self._sentences: dict[str, None] = {}
-        self._notes: dict[NoteKey, Note] = {}
+        self._notes: dict[Note, None] = {}
         self._remarks: dict[str, tuple[str, ...]] = {}
 
     def add(self, *notes: str | Note) -> None:
@@ -437,7 +433,7 @@ class Notes:
                 self._sentences.setdefault(note)
                 continue
             self.added += 1
-            self._notes.setdefault((note.kind, note.file, note.since, note.until), note)
+            self._notes.setdefault(note)
 
     def add_lack(self, note: str | Note) -> None:
         """Adds a note on data that the answer needs and that could not be read."""
@@ -463,7 +459,7 @@ class Notes:
         not.
         """
         by_kind: dict[Reason, dict[str, str]] = {}
-        for note in _farthest(self._notes.values()):
+        for note in _farthest(self._notes):
             # Another sentence may have reported it already, from the summary of the bag.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
@@ -482,31 +478,29 @@ class Notes:
         name = short_name(bag.path)
         if name in self._remarks:
             return False
-        own = [note for note in self._notes.values() if note.file == name]
+        own = [note for note in self._notes if note.file == name]
         details = {note.detail for note in _farthest(own)}
         return details.issuperset(bag.summary.remarks)
 
-    def keys(self) -> frozenset[NoteKey]:
-        """Returns the keys of all notes, for `retract_outside`."""
+    def so_far(self) -> frozenset[Note]:
+        """Returns all notes, for `retract_outside`."""
         return frozenset(self._notes)
 
-    def retract_outside(
-        self, *windows: TimeWindow, keep: Collection[NoteKey] = frozenset()
-    ) -> None:
+    def retract_outside(self, *windows: TimeWindow, keep: Collection[Note] = frozenset()) -> None:
         """Removes the notes that concern none of the windows, except the notes to `keep`.
 
         Which bags are read besides depends on what is stored, and the reply must not.
         """
         self._notes = {
-            key: note
-            for key, note in self._notes.items()
-            if key in keep or any(window.overlaps(note.since, note.until) for window in windows)
+            note: None
+            for note in self._notes
+            if note in keep or any(window.overlaps(note.since, note.until) for window in windows)
         }
 
 
 def _farthest(notes: Iterable[Note]) -> Iterable[Note]:
     """Returns one note for each kind and file: the one that reaches farthest."""
-    ascending = sorted(notes, key=attrgetter("until", "since"))
+    ascending = sorted(notes, key=attrgetter("until", "since", "detail"))
     return {(note.kind, note.file): note for note in ascending}.values()
 
 

@@ -57,9 +57,10 @@ if TYPE_CHECKING:
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
 _CONSTANT: Final = re.compile(
-    r"^[ \t]*[a-z]+[0-9]*[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\b", re.MULTILINE
+    r"^[ \t]*(?:u?int[0-9]+|byte|char)[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\s*(?:#|$)",
+    re.MULTILINE,
 )
-"""A constant in the text of a message definition, as ROS 2 writes it."""
+"""A constant that is a whole number, in the text of a message definition, as ROS 2 writes it."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_EMPTY: Final = 200
@@ -533,7 +534,7 @@ class ReverseSearch:
         """
         window = TimeWindow(since, until)
         candidates = CandidateRows(self._view, self.topics, self.condition, window)
-        noted_before = self._view.notes.keys()
+        noted_before = self._view.notes.so_far()
         try:
             for stored in candidates.messages():
                 if self.matches(stored):

@@ -389,7 +389,7 @@ def _parallel_recordings(
     """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
-    noted_before = view.notes.keys()
+    noted_before = view.notes.so_far()
     try:
         for parallel in _overlapping_pairs(view, topic, window):
             pair = parallel.first, parallel.other

@@ -166,6 +166,8 @@ class LakeIndex:
             # The last day with bags, and the next one: what lies across midnight goes on there, and
             # a gap up to it is no end of the memory.
             days = [*self.lake.days("bags").get(self.robot, {})]
+            if not days:  # all was forgotten since
+                return replace(current, timeline=Timeline(), older=None)
             later = bisect_right(days, day_of(reach))
             first, until = days[max(later - 1, 0)], days[min(later, len(days) - 1)]
             window = self._window(until, (until - first).days + 1)

@@ -200,8 +200,8 @@ class LakeLocation:
             lost = f"if it is lost for good, delete {path}"
             raise LakeError(f"this lake has another writer, with {whose}: {do}; {lost}")
 
-    def last_commit(self) -> Ns | None:
-        """Returns when a bag was last committed; None if none was. Creates no file.
+    def last_change(self) -> Ns | None:
+        """Returns when the bags of the lake last changed; None if it has none. Creates no file.
 
         Raises:
             LakeError: the lake cannot be read.
@@ -213,7 +213,9 @@ class LakeLocation:
             if not catalog.table_exists(name):
                 return None
             newest = catalog.load_table(name).current_snapshot()
-            return None if newest is None else newest.timestamp_ms * NS_PER_MS
+            if newest is None or (newest.summary and newest.summary["total-records"] == "0"):
+                return None
+            return newest.timestamp_ms * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,17 +404,18 @@ class Partitions:
             RefusedError: another program wrote files that are not of one robot and day.
         """
         snapshot = table.current_snapshot()
-        if snapshot is None or snapshot.snapshot_id == self._snapshot:
+        snapshot_id = None if snapshot is None else snapshot.snapshot_id
+        if snapshot_id == self._snapshot:
             return self._robots
         by_manifest: dict[str, Sequence[_PartitionFile]] = {}
-        for manifest in snapshot.manifests(table.io):
+        for manifest in [] if snapshot is None else snapshot.manifests(table.io):
             path = manifest.manifest_path
             by_manifest[path] = self._by_manifest.get(path) or [*_files_in(manifest, table)]
         robots: dict[str, dict[date, list[LakeFile]]] = {}
         for robot, day, file in sorted(chain.from_iterable(by_manifest.values())):
             robots.setdefault(robot, {}).setdefault(day, []).append(file)
         self._by_manifest, self._robots = by_manifest, robots
-        self._snapshot = snapshot.snapshot_id
+        self._snapshot = snapshot_id
         return robots
 
 

@@ -229,7 +229,10 @@ class HandoverTransfer:
         return Step.COMPLETE if is_over else Step.WAIT
 
     def complete(self, now: ClockReading) -> bool:
-        """Writes the cut if both recorders receive messages; returns False if they do not yet.
+        """Writes the cut; returns False if both recorders do not receive messages yet.
+
+        No cut is written if a simulated clock stamps both times of a message: the old recording
+        counts up to its end.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -237,10 +240,9 @@ class HandoverTransfer:
         if self._both_since is None:
             return False
         old, new = self.directories
-        closed = self.old.splits.closed_names
-        clock = cut_clock(old / max(closed), self.orders.reader) if closed else CutClock.PUBLISH
+        newest = self.old.splits.newest_closed()
+        clock = cut_clock(newest, self.orders.reader) if newest else CutClock.PUBLISH
         if self.orders.simulated and clock is CutClock.LOG:
-            # No time of the wall clock separates them: the old one counts up to its end.
             return True
         old_sidecar, new_sidecar = complete_sidecars(
             handover_to_change(old),

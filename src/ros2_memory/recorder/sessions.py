@@ -125,6 +125,16 @@ class Splits:
         """The splits that were closed at the last observation."""
         return frozenset(name for name, split in self._files.items() if split.closed)
 
+    def newest_closed(self) -> Path | None:
+        """Returns the path of the closed split that began last, of those that are still there."""
+        closed = [
+            (split.start, name)
+            for name, split in self._files.items()
+            if split.closed and split.start < MAX_NS
+        ]
+        paths = (self.directory / name for _, name in sorted(closed, reverse=True))
+        return next((path for path in paths if path.exists()), None)
+
     @property
     def seen(self) -> Collection[str]:
         """The names of all splits that any observation found."""

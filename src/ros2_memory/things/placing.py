@@ -29,7 +29,6 @@ from ros2_memory.analysis.sights import (
     fixes_of,
     sights_of,
 )
-from ros2_memory.core.arrays import Ints, run_starts
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.columns.units import Rows
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
@@ -275,15 +275,19 @@ class Placer:
         return times, np.array([sigma for _, sigma in said], np.float64)
 
     def _localiser_messages(self, session: Session, window: TimeWindow) -> Iterator[StoredMessage]:
-        """Yields a message of each localiser in each `_SAID_NS` of the clock."""
+        """Yields what each localiser said last in each `_SAID_NS` of the clock, up to its end.
+
+        Fixes lie at such ends, so it does not matter to them where scans cut the time in between.
+        """
         timeline = self._view.timeline
         for topic in timeline.topics():
             if LOCALISER not in timeline.types_of(topic):
                 continue
             for rows in scan(self._view, topic, window):
                 if self._sessions.session_of(rows.recording) == session:
-                    firsts = run_starts(rows.times // _SAID_NS)
-                    yield from messages_of(self._view, rows.some(firsts))
+                    ends = -(-rows.times // _SAID_NS)
+                    lasts = np.flatnonzero(np.diff(ends, append=MAX_NS))
+                    yield from messages_of(self._view, rows.some(lasts))
 
 
 def _fix_times(first: Ns, last: Ns) -> tuple[Ints, Ns]:

@@ -159,7 +159,7 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     ship(0, robots)
     told = found()
     assert [*told] == ["lake ok"]
-    assert "its newest commit is from" in told["lake ok"][0]
+    assert "its bags last changed" in told["lake ok"][0]
     can = os.access
     own = tmp_path / "hall" / ".episodic"
     monkeypatch.setattr(

@@ -85,6 +85,13 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
         newest("EMPTY")
 
 
+def test_a_constant_that_is_no_whole_number_is_not_taken_for_one(tmp_path: Path) -> None:
+    body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
+    write_mcap(tmp_path / "bag.mcap", [Msg("/winch", "winch_msgs/msg/Winch", T0, body)])
+    with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
+        last(memory_of(tmp_path), "equals", "CABLE_LONGEST", "/winch", field="cable")
+
+
 @pytest.mark.parametrize("recalls", [False, True])
 def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recalls: bool) -> None:
     level = make("std_msgs/msg/Float32", data=45.5)

@@ -20,14 +20,15 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.fields import describe_type
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import LakeIndex, newest_days
-from ros2_memory.lake.tables import day_of
+from ros2_memory.lake.tables import NAMESPACE, TABLES, day_of, open_tables
+from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import Days, LakeFile
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match, TypeFields
 from tests.support.bags import Msg, battery, boolean, detections, text, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
-from tests.support.lakes import lake_in, lake_robot, lake_robots, robot_bags, ship
+from tests.support.lakes import lake_in, lake_robot, lake_robots, location, robot_bags, ship
 
 DAY_S = 86_400
 
@@ -153,6 +154,31 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
     pause = (START_S + 24) * NS_PER_S, (START_S + 30) * NS_PER_S
     for robot in (on_robot.memory, lake_robot(tmp_path / "lake")):
         assert [*robot.index.refresh().gaps] == [pause]
+
+
+def test_a_lake_without_a_bag_shows_none_that_it_had(shipping: Shipping, tmp_path: Path) -> None:
+    """Be it that everything was forgotten, or that its tables were made again."""
+    shipping.ship([START_S - 40 * DAY_S, START_S])
+    where, index = location(tmp_path / "lake"), shipping.robot(days=1, most_bags=1).index
+    assert isinstance(index, LakeIndex)
+    assert index.snapshot().older is not None
+    assert where.last_change() is not None
+    everything = Tombstone("hall", 0, START_S * 2 * NS_PER_S)
+    with where.writable() as tables:
+        forget_in_lake(tables, everything)
+    shipping.lake.refresh()  # as the index of another robot does
+    assert not index.snapshot((START_S - 40 * DAY_S) * NS_PER_S).bags
+    assert where.last_change() is None
+    shipping.ship([START_S + 60], label="fork")
+    assert [*shipping.lake.days("bags")] == []
+    shipping.lake.refresh()
+    assert [*shipping.lake.days("bags")] == ["hall"]
+    with where.opened() as catalog:
+        for name in TABLES:
+            catalog.drop_table(f"{NAMESPACE}.{name}")
+        open_tables(catalog, TABLES)
+    shipping.lake.refresh()
+    assert [*shipping.lake.days("bags")] == []
 
 
 def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:

@@ -363,4 +363,4 @@ def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path
     with rest_catalogue(tmp_path / "lake") as uri:
         where = replace(location(tmp_path / "lake"), catalog="rest", uri=uri)
         ship_and_ask(where, tmp_path / "hall")
-        assert where.last_commit() is not None
+        assert where.last_change() is not None

@@ -33,6 +33,7 @@ from ros2_memory.recorder.handover import (
     settle_handover,
     void_sidecar,
 )
+from ros2_memory.recorder.sessions import Splits
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, write_mcap
 from tests.support.examples import examples
@@ -284,6 +285,21 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
     after = read_handover(tmp_path / "b").handover
     assert (after.notes, after.also_counts) == ((LOG_CLOCK_NOTE,), {})
     assert_union(tmp_path)
+
+
+def test_the_newest_closed_split_is_the_last_of_those_that_retention_did_not_delete(
+    tmp_path: Path,
+) -> None:
+    """It shows by which time a recorder stamps, and no longer does once it is gone."""
+    for number in range(11):
+        write_mcap(tmp_path / f"a_{number}.mcap", [boolean(T0 + number * S, True)])
+    write_mcap(tmp_path / "a_11.mcap", [boolean(T0 + 11 * S, True)], TRUNCATED)
+    splits = Splits(tmp_path, READER)
+    assert splits.newest_closed() is None
+    splits.observe(0.0)
+    assert splits.newest_closed() == tmp_path / "a_10.mcap"
+    (tmp_path / "a_10.mcap").unlink()
+    assert splits.newest_closed() == tmp_path / "a_9.mcap"
 
 
 def test_where_too_many_would_be_listed_all_count(

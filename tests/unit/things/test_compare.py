@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.arrays import Ints
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.things.places import Sightings, stays_in
-from tests.support.bags import Msg, header, make, point, quaternion, write_splits
-from tests.support.memories import asked, memory_of
+from tests.support.bags import Msg, header, make, point, quaternion, write_mcap, write_splits
+from tests.support.memories import asked, each_way, memory_of
 from tests.unit.things.test_find import (
     BEGIN,
     HERE,
@@ -229,3 +230,20 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
     assert any("localisation was poor" in note for note in reply.get("notes", [])) == is_poor
+
+
+@each_way
+@pytest.mark.parametrize("cut_s", [60.0, 89.75])
+@pytest.mark.parametrize("sigmas_m", [(0.1, 1.0), (1.0, 0.1)])
+def test_the_covariance_that_a_localiser_gave_last_counts_wherever_its_bags_are_cut(
+    tmp_path: Path, sigmas_m: tuple[float, float], cut_s: float, recalls: bool
+) -> None:
+    """A localiser says nothing while the robot stands: its last message holds until the next."""
+    given = [amcl(at, sigma_m) for at, sigma_m in zip((89.6, 89.9), sigmas_m, strict=True)]
+    messages = [amcl(0, 0.1), *seen_off(0, 30, 0.0), *given, *seen_off(90, 116, 0.4)]
+    cut = ns_from_unix(BEGIN + cut_s)
+    before = [message for message in messages if message.log_time < cut]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", before)
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[len(before) :])
+    reply = asked(memory_of(tmp_path, limits=NAMED, recalls=recalls), "find_things")
+    assert ["moved" in thing for thing in reply["things"]] == [sigmas_m[-1] < 1.0] * 2
