@@ -19,8 +19,9 @@ from ros2_memory.recorder.__main__ import main
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.forked_commands import Forked
+from tests.support.housekeepers import own_all
 from tests.support.live_recorder import LiveRecorder
 from tests.support.processes import PATIENCE_S, service_manager, until
 from tests.support.simulated_recorders import published
@@ -152,16 +153,23 @@ def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) ->
     assert states == {Closing.CLOSED}
 
 
-def test_bags_of_another_program_outlive_every_limit(site: Site) -> None:
+def test_what_a_crash_left_is_repaired_and_bags_of_another_program_outlive_every_limit(
+    site: Site,
+) -> None:
+    messages = [odom(10**18 + number, 1.0, 2.0) for number in range(9)]
+    left_open = McapLayout(chunk_size=99, finish=False)
+    crashed = write_mcap(site.bag_dir / "rec_crashed" / "0.mcap", messages, left_open)
+    own_all(site.bag_dir)
     folder = site.bag_dir / "session_mcap"
-    old = folder / "session_mcap_0.mcap"
-    write_mcap(old, [odom(10**18 + number, 1.0, 2.0) for number in range(9)])
+    write_mcap(folder / "session_mcap_0.mcap", messages)
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     before = {path: path.read_bytes() for path in folder.iterdir()}
     daemon = site.run("retention.max_total_gb=0.000001", "retention.max_age_h=0.001")
     daemon.wait_for("foreign_bags_kept")
-    until(lambda: any(event["bags"] for event in daemon.events("retention_applied")) or None)
+    until(lambda: any(event["bags"] for event in daemon.events("retention_applied")))
+    [repaired] = daemon.events("bag_repaired")
     daemon.stop()
+    assert (repaired["path"], crashed.exists()) == (str(crashed), False)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
@@ -269,54 +277,53 @@ def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:
     assert (site.bag_dir / "notes.txt").exists()
 
 
-class TestRefusals:
-    @pytest.mark.parametrize("listed", ["[odom]", "[]"])
-    def test_a_refused_list_of_topics_is_named_and_touches_no_bag(
-        self, site: Site, listed: str
-    ) -> None:
-        old = site.old_bag()
-        site.topics.write_text(f"topics: {listed}\n")
-        code, message = site.refusal_here("recording.clear_on_startup=true")
-        assert code == 2
-        assert str(site.topics) in message
-        assert "'odom' cannot be recorded" in message or listed == "[]"
-        assert [path.name for path in site.bag_dir.rglob("*")] == ["rec_old", old.name]
+@pytest.mark.parametrize("listed", ["[odom]", "[]"])
+def test_a_refused_list_of_topics_is_named_and_touches_no_bag(site: Site, listed: str) -> None:
+    old = site.old_bag()
+    site.topics.write_text(f"topics: {listed}\n")
+    code, message = site.refusal_here("recording.clear_on_startup=true")
+    assert code == 2
+    assert str(site.topics) in message
+    assert "'odom' cannot be recorded" in message or listed == "[]"
+    assert [path.name for path in site.bag_dir.rglob("*")] == ["rec_old", old.name]
 
-    def test_nothing_is_written_where_clearing_is_refused(self, site: Site) -> None:
-        site.bag_dir.mkdir(parents=True)
-        site.env["HOME"] = str(site.bag_dir)
-        code, message = site.refusal_here("recording.clear_on_startup=true")
-        assert code == 1
-        assert "refuses to delete bags" in message
-        assert list(site.bag_dir.iterdir()) == []
 
-    @pytest.mark.parametrize("cause", ["no ros2", "no setup file"])
-    def test_a_start_that_is_refused_clears_nothing_and_leaves_no_lock(
-        self, site: Site, cause: str
-    ) -> None:
-        old, env, setup = site.old_bag(), site.env, []
-        if cause == "no ros2":
-            site.env = {**env, "PATH": os.defpath}
-        else:
-            setup = [f"recorder.setup_files=[{site.folder}/none.bash]"]
-        code, message = site.refusal_here("recording.clear_on_startup=true", *setup)
-        assert (code, "recorder.setup_files" in message) == (1, True)
-        assert old.read_bytes() == b"old"
-        # While the process that was refused lives on.
-        site.env = env
-        site.run().stop()
+def test_nothing_is_written_where_clearing_is_refused(site: Site) -> None:
+    site.bag_dir.mkdir(parents=True)
+    site.env["HOME"] = str(site.bag_dir)
+    code, message = site.refusal_here("recording.clear_on_startup=true")
+    assert code == 1
+    assert "refuses to delete bags" in message
+    assert list(site.bag_dir.iterdir()) == []
 
-    def test_a_bag_directory_that_cannot_be_made_is_named(self, site: Site) -> None:
-        site.bag_dir.write_text("a file")
-        code, message = site.refusal_here()
-        assert code == 1
-        assert "recording.bag_dir" in message
 
-    def test_a_bag_directory_whose_name_ros2_cannot_take_is_named(self, site: Site) -> None:
-        folder = quoted(os.fsdecode(os.fsencode(site.folder) + b"/S\xfcd"))
-        code, message = site.refusal_here(f"recording.bag_dir={folder}")
-        assert code == 1
-        assert "takes no path that is not UTF-8" in message
+@pytest.mark.parametrize("cause", ["no ros2", "no setup file"])
+def test_a_start_that_is_refused_clears_nothing_and_leaves_no_lock(site: Site, cause: str) -> None:
+    old, env, setup = site.old_bag(), site.env, []
+    if cause == "no ros2":
+        site.env = {**env, "PATH": os.defpath}
+    else:
+        setup = [f"recorder.setup_files=[{site.folder}/none.bash]"]
+    code, message = site.refusal_here("recording.clear_on_startup=true", *setup)
+    assert (code, "recorder.setup_files" in message) == (1, True)
+    assert old.read_bytes() == b"old"
+    # While the process that was refused lives on.
+    site.env = env
+    site.run().stop()
+
+
+def test_a_bag_directory_that_cannot_be_made_is_named(site: Site) -> None:
+    site.bag_dir.write_text("a file")
+    code, message = site.refusal_here()
+    assert code == 1
+    assert "recording.bag_dir" in message
+
+
+def test_a_bag_directory_whose_name_ros2_cannot_take_is_named(site: Site) -> None:
+    folder = quoted(os.fsdecode(os.fsencode(site.folder) + b"/S\xfcd"))
+    code, message = site.refusal_here(f"recording.bag_dir={folder}")
+    assert code == 1
+    assert "takes no path that is not UTF-8" in message
 
 
 def test_ctrl_c_while_it_reads_its_configuration_is_an_interruption() -> None:

@@ -231,111 +231,111 @@ async def test_the_bag_directory_may_be_a_link_itself(bags: Path, tmp_path: Path
         assert "position" in await told(server, "get_topic_at_time", given)
 
 
-class TestDeletions:
-    """What deletes: retention has its tests beside it (`test_housekeeping.py`)."""
-
-    @pytest.mark.usefixtures("linked")
-    def test_a_repair_the_next_start_and_a_wipe_leave_what_a_link_leads_to(
-        self, bags: Path, outside: Path
-    ) -> None:
-        cut = outside / "rec_0.mcap"
-        cut.write_bytes(cut.read_bytes()[:-100])
-        (outside / "rec_9.mcap").touch()
-        write_handover(outside, Handover(next="rec_2"))
-        with untouched(outside):
-            recover_files(bags, force=True)
-            recover_handovers(bags, McapReader())
-            clear_bags(bags)
-
-    def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
-        self, bags: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
-        real, moved = os.open, bags / "moved"
-
-        def swapping(path: Any, *given: Any, **more: Any) -> int:
-            if path == "rec" and not moved.exists():
-                (bags / "rec").rename(moved)
-                (bags / "rec").symlink_to(outside)
-            return real(path, *given, **more)
-
-        monkeypatch.setattr(os, "open", swapping)
-        with untouched(outside):
-            assert len(clear_bags(bags).faults) == 1
-        assert moved.exists()
-
-    def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
-        self, bags: Path, outside: Path
-    ) -> None:
-        cut = outside / "rec_0.mcap"
-        cut.write_bytes(cut.read_bytes()[:-100])
-        (outside / "rec_9.mcap").touch()
-        (outside / ".rec_9.mcap.repair").write_bytes(b"kept")
-        (bags / "linked").symlink_to(outside)
-        with untouched(outside):
-            assert not remove_if_empty(bags / "linked")
-            for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
-                with pytest.raises(RecorderError, match="symbolic link") as refused:
-                    recover_files(path, force=True)
-                assert str(path.resolve()) in str(refused.value)
-                if path.suffix:
-                    with pytest.raises(BagError, match="behind a symbolic link"):
-                        build_repairer().repair(path)
-
-    def test_nothing_is_asked_for_or_answered_behind_a_link(
-        self, bags: Path, outside: Path
-    ) -> None:
-        (outside / "requests").mkdir()
-        (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
-        with untouched(outside):
-            (bags / ".episodic").symlink_to(outside)
-            with pytest.raises(OSError, match="symbolic link"):
-                PendingRequest(bags, "label", 0, 1, 2).post()
-            queue = RequestQueue(bags)
-            queue.open()
-            assert not queue.has_requests()
-
-    def test_a_store_behind_a_link_is_neither_written_nor_set_aside(
-        self, bags: Path, outside: Path
-    ) -> None:
-        (outside / "columns.sqlite").write_text("somebody's own")
-        with untouched(outside):
-            (bags / ".episodic").symlink_to(outside)
-            (bags / "own").mkdir()
-            for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
-                link = bags / "own" / name
-                link.symlink_to(outside / "columns.sqlite")
-                refused = open_file([bags / "own" / "columns.sqlite"])
-                assert "symbolic link" in str(refused)
-                link.unlink()
-            assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
+# What deletes: retention has its tests beside it (`test_housekeeping.py`).
 
 
-class TestWhatTheRecorderKeepsBesideBags:
-    def test_no_sidecar_is_read_through_a_link(self, bags: Path, outside: Path) -> None:
-        (outside / "other.json").write_text('{"format": 1}')
-        (bags / "run/handover.json").symlink_to(outside / "other.json")
-        (bags / "recorder.json").symlink_to(outside / "other.json")
-        (bags / "run/metadata.yaml").symlink_to(outside / "metadata.yaml")
-        with hearing():
-            assert "symbolic links" in (read_handover(bags / "run").problem or "")
-            assert read_heartbeat(bags).heartbeat is None
-            assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
+@pytest.mark.usefixtures("linked")
+def test_a_repair_the_next_start_and_a_wipe_leave_what_a_link_leads_to(
+    bags: Path, outside: Path
+) -> None:
+    cut = outside / "rec_0.mcap"
+    cut.write_bytes(cut.read_bytes()[:-100])
+    (outside / "rec_9.mcap").touch()
+    write_handover(outside, Handover(next="rec_2"))
+    with untouched(outside):
+        recover_files(bags, force=True)
+        recover_handovers(bags, McapReader())
+        clear_bags(bags)
 
-    def test_nothing_is_written_through_a_link(self, bags: Path, outside: Path) -> None:
-        kept = outside / "metadata.yaml"
-        with untouched(outside):
-            (bags / ".recorder.json.tmp").symlink_to(kept)
-            with pytest.raises(OSError, match="symbolic links"):
-                write_durably(bags / "recorder.json", "{}")
-            (bags / "recorder.json").symlink_to(kept)
+
+def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
+    bags: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
+    real, moved = os.open, bags / "moved"
+
+    def swapping(path: Any, *given: Any, **more: Any) -> int:
+        if path == "rec" and not moved.exists():
+            (bags / "rec").rename(moved)
+            (bags / "rec").symlink_to(outside)
+        return real(path, *given, **more)
+
+    monkeypatch.setattr(os, "open", swapping)
+    with untouched(outside):
+        assert len(clear_bags(bags).faults) == 1
+    assert moved.exists()
+
+
+def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
+    bags: Path, outside: Path
+) -> None:
+    cut = outside / "rec_0.mcap"
+    cut.write_bytes(cut.read_bytes()[:-100])
+    (outside / "rec_9.mcap").touch()
+    (outside / ".rec_9.mcap.repair").write_bytes(b"kept")
+    (bags / "linked").symlink_to(outside)
+    with untouched(outside):
+        assert not remove_if_empty(bags / "linked")
+        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
+            with pytest.raises(RecorderError, match="symbolic link") as refused:
+                recover_files(path, force=True)
+            assert str(path.resolve()) in str(refused.value)
+            if path.suffix:
+                with pytest.raises(BagError, match="behind a symbolic link"):
+                    build_repairer().repair(path)
+
+
+def test_nothing_is_asked_for_or_answered_behind_a_link(bags: Path, outside: Path) -> None:
+    (outside / "requests").mkdir()
+    (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
+    with untouched(outside):
+        (bags / ".episodic").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            PendingRequest(bags, "label", 0, 1, 2).post()
+        queue = RequestQueue(bags)
+        queue.open()
+        assert not queue.has_requests()
+
+
+def test_a_store_behind_a_link_is_neither_written_nor_set_aside(bags: Path, outside: Path) -> None:
+    (outside / "columns.sqlite").write_text("somebody's own")
+    with untouched(outside):
+        (bags / ".episodic").symlink_to(outside)
+        (bags / "own").mkdir()
+        for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
+            link = bags / "own" / name
+            link.symlink_to(outside / "columns.sqlite")
+            refused = open_file([bags / "own" / "columns.sqlite"])
+            assert "symbolic link" in str(refused)
+            link.unlink()
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
+
+
+def test_no_sidecar_is_read_through_a_link(bags: Path, outside: Path) -> None:
+    (outside / "other.json").write_text('{"format": 1}')
+    (bags / "run/handover.json").symlink_to(outside / "other.json")
+    (bags / "recorder.json").symlink_to(outside / "other.json")
+    (bags / "run/metadata.yaml").symlink_to(outside / "metadata.yaml")
+    with hearing():
+        assert "symbolic links" in (read_handover(bags / "run").problem or "")
+        assert read_heartbeat(bags).heartbeat is None
+        assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
+
+
+def test_nothing_is_written_through_a_link(bags: Path, outside: Path) -> None:
+    kept = outside / "metadata.yaml"
+    with untouched(outside):
+        (bags / ".recorder.json.tmp").symlink_to(kept)
+        with pytest.raises(OSError, match="symbolic links"):
             write_durably(bags / "recorder.json", "{}")
-            (bags / "recorder.lock").symlink_to(outside / "lock")
-            with pytest.raises(RecorderError, match="cannot be opened"):
-                BagDirLock.acquire(bags)
-            (bags / "x.mcap").symlink_to(kept)
-            with pytest.raises(BagError, match="File exists"):
-                McapWriter().write(bags / "x.mcap", [])
+        (bags / "recorder.json").symlink_to(kept)
+        write_durably(bags / "recorder.json", "{}")
+        (bags / "recorder.lock").symlink_to(outside / "lock")
+        with pytest.raises(RecorderError, match="cannot be opened"):
+            BagDirLock.acquire(bags)
+        (bags / "x.mcap").symlink_to(kept)
+        with pytest.raises(BagError, match="File exists"):
+            McapWriter().write(bags / "x.mcap", [])
 
 
 HOSTILE = (

@@ -50,42 +50,43 @@ FULL = Handover(
 )
 
 
-class TestFile:
-    @given(handover=HANDOVERS)
-    def test_what_is_written_is_read(
-        self, tmp_path_factory: pytest.TempPathFactory, handover: Handover
-    ) -> None:
-        folder = tmp_path_factory.mktemp("recording")
-        write_handover(folder, handover)
-        assert read_handover(folder) == (handover, None)
+@given(handover=HANDOVERS)
+def test_what_is_written_is_read(
+    tmp_path_factory: pytest.TempPathFactory, handover: Handover
+) -> None:
+    folder = tmp_path_factory.mktemp("recording")
+    write_handover(folder, handover)
+    assert read_handover(folder) == (handover, None)
 
-    @pytest.mark.parametrize(
-        ("change", "reason"),
-        [
-            ({"format": 2}, "format is 2"),
-            ({"state": "maybe"}, "state: Input should be 'counts', 'pending' or 'void'"),
-            ({"previous": "../elsewhere"}, "previous: Value error, it must be the name of"),
-            *(({"next": name}, "name of a recording") for name in ("..", ".", "/etc", "")),
-            ({"counts_from_ns": True}, "counts_from_ns: Input should be a valid integer"),
-            ({"counts_until_ns": 2**63}, "counts_until_ns: Input should be less than"),
-            ({"begin": []}, "begin: Input should be a dictionary"),
-            ({"end": {"files": "x"}}, "end.log_from_ns: Field required"),
-        ],
-    )
-    def test_what_it_cannot_mean_is_told_and_then_everything_counts(
-        self, tmp_path: Path, change: dict[str, object], reason: str
-    ) -> None:
-        write_handover(tmp_path, FULL)
-        path = tmp_path / HANDOVER_FILE
-        path.write_text(json.dumps(json.loads(path.read_text()) | change))
-        handover, problem = read_handover(tmp_path)
-        assert handover == Handover()
-        assert problem is not None
-        assert reason in problem
 
-    @pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"\xff", b"[" * 100_000, b" " * (2 << 20)])
-    def test_any_bytes_are_read_without_failing(self, tmp_path: Path, text: bytes) -> None:
-        (tmp_path / HANDOVER_FILE).write_bytes(text)
-        handover, problem = read_handover(tmp_path)
-        assert handover == Handover()
-        assert problem is not None
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format": 2}, "format is 2"),
+        ({"state": "maybe"}, "state: Input should be 'counts', 'pending' or 'void'"),
+        ({"previous": "../elsewhere"}, "previous: Value error, it must be the name of"),
+        *(({"next": name}, "name of a recording") for name in ("..", ".", "/etc", "")),
+        ({"counts_from_ns": True}, "counts_from_ns: Input should be a valid integer"),
+        ({"counts_until_ns": 2**63}, "counts_until_ns: Input should be less than"),
+        ({"begin": []}, "begin: Input should be a dictionary"),
+        ({"end": {"files": "x"}}, "end.log_from_ns: Field required"),
+    ],
+)
+def test_what_it_cannot_mean_is_told_and_then_everything_counts(
+    tmp_path: Path, change: dict[str, object], reason: str
+) -> None:
+    write_handover(tmp_path, FULL)
+    path = tmp_path / HANDOVER_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    handover, problem = read_handover(tmp_path)
+    assert handover == Handover()
+    assert problem is not None
+    assert reason in problem
+
+
+@pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"\xff", b"[" * 100_000, b" " * (2 << 20)])
+def test_any_bytes_are_read_without_failing(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / HANDOVER_FILE).write_bytes(text)
+    handover, problem = read_handover(tmp_path)
+    assert handover == Handover()
+    assert problem is not None

@@ -55,47 +55,47 @@ def test_a_full_disk_keeps_nobody_from_taking_it(tmp_path: Path) -> None:
     lock.release()
 
 
-class TestRenewal:
-    def test_a_lock_whose_file_was_deleted_keeps_others_out_again(self, tmp_path: Path) -> None:
-        lock = BagDirLock.acquire(tmp_path)
-        number = lock.descriptor
-        (tmp_path / LOCK_FILE).unlink()
-        assert lock.renew()
-        assert lock.descriptor == number
-        assert not os.get_inheritable(number)
+def test_a_lock_whose_file_was_deleted_keeps_others_out_again(tmp_path: Path) -> None:
+    lock = BagDirLock.acquire(tmp_path)
+    number = lock.descriptor
+    (tmp_path / LOCK_FILE).unlink()
+    assert lock.renew()
+    assert lock.descriptor == number
+    assert not os.get_inheritable(number)
+    assert not lock.renew()
+    assert f"process {os.getpid()} on" in refusal(tmp_path)
+    lock.release()
+    BagDirLock.acquire(tmp_path).release()
+
+
+def test_a_directory_that_has_gone_is_locked_once_it_is_there_again(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    bag_dir.mkdir()
+    lock = BagDirLock.acquire(bag_dir)
+    bag_dir.rename(tmp_path / "elsewhere")
+    assert not lock.renew()
+    bag_dir.mkdir()
+    assert lock.renew()
+    lock.release()
+
+
+def test_what_another_has_taken_since_is_not_recorded_into(tmp_path: Path) -> None:
+    lock = BagDirLock.acquire(tmp_path)
+    (tmp_path / LOCK_FILE).unlink()
+    descriptor = held_by(tmp_path, json.dumps({"pid": 1, "host": socket.gethostname()}))
+    with pytest.raises(RecorderError, match="process 1 on"):
+        lock.renew()
+    os.close(descriptor)
+    lock.release()
+
+
+def test_a_directory_that_cannot_be_looked_at_is_locked_as_before(tmp_path: Path) -> None:
+    lock = BagDirLock.acquire(tmp_path)
+
+    with broken(os, "stat", errno.EIO):
         assert not lock.renew()
-        assert f"process {os.getpid()} on" in refusal(tmp_path)
-        lock.release()
-        BagDirLock.acquire(tmp_path).release()
-
-    def test_a_directory_that_has_gone_is_locked_once_it_is_there_again(
-        self, tmp_path: Path
-    ) -> None:
-        bag_dir = tmp_path / "bags"
-        bag_dir.mkdir()
-        lock = BagDirLock.acquire(bag_dir)
-        bag_dir.rename(tmp_path / "elsewhere")
-        assert not lock.renew()
-        bag_dir.mkdir()
-        assert lock.renew()
-        lock.release()
-
-    def test_what_another_has_taken_since_is_not_recorded_into(self, tmp_path: Path) -> None:
-        lock = BagDirLock.acquire(tmp_path)
-        (tmp_path / LOCK_FILE).unlink()
-        descriptor = held_by(tmp_path, json.dumps({"pid": 1, "host": socket.gethostname()}))
-        with pytest.raises(RecorderError, match="process 1 on"):
-            lock.renew()
-        os.close(descriptor)
-        lock.release()
-
-    def test_a_directory_that_cannot_be_looked_at_is_locked_as_before(self, tmp_path: Path) -> None:
-        lock = BagDirLock.acquire(tmp_path)
-
-        with broken(os, "stat", errno.EIO):
-            assert not lock.renew()
-        assert f"process {os.getpid()} on" in refusal(tmp_path)
-        lock.release()
+    assert f"process {os.getpid()} on" in refusal(tmp_path)
+    lock.release()
 
 
 @needs_mounts

@@ -40,64 +40,62 @@ def request(label: str = "charger found", number: str = NUMBER) -> SaveRequest:
     return SaveRequest(number, label, T0 - 30 * S, T0, T0)
 
 
-class TestLabels:
-    def test_one_is_what_can_be_seen_and_is_not_too_long(self) -> None:
-        for label in ("a", "Küche, 2. Stock", "充電 /../ etc", "x" * 120, "it's 🙂"):
-            assert fault_of_label(label) is None
-        unseen = ("", "  ", "two\nlines", "tab\t", "nul\0", "\u202eedoc", "\ud800", "\u2028")
-        for label in (*unseen, "x" * 121):
-            assert fault_of_label(label)
-
-    def test_moments_of_one_label_and_second_have_folders_of_their_own(
-        self, tmp_path: Path
-    ) -> None:
-        names = [make_moment_folder(tmp_path, request()).name for _ in range(3)]
-        assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
-
-    @given(st.text(max_size=130))
-    def test_any_of_them_names_a_folder_that_is_safe(self, label: str) -> None:
-        name = folder_name(request(label))
-        assert re.fullmatch(r"20261120T050000Z-[a-z0-9]+(-[a-z0-9]+)*", name)
-        assert bag_kind(name) is None
-        assert len(name) < 64
+def test_a_label_is_what_can_be_seen_and_is_not_too_long() -> None:
+    for label in ("a", "Küche, 2. Stock", "充電 /../ etc", "x" * 120, "it's 🙂"):
+        assert fault_of_label(label) is None
+    unseen = ("", "  ", "two\nlines", "tab\t", "nul\0", "\u202eedoc", "\ud800", "\u2028")
+    for label in (*unseen, "x" * 121):
+        assert fault_of_label(label)
 
 
-class TestMomentFiles:
-    @given(
-        st.text(min_size=1, max_size=120).filter(lambda text: not fault_of_label(text)),
-        st.booleans(),
-        st.lists(st.text(st.characters(exclude_categories=["Cs"])), max_size=3),
-    )
-    def test_what_is_written_is_read(
-        self,
-        tmp_path_factory: pytest.TempPathFactory,
-        label: str,
-        pending: bool,
-        missing: list[str],
-    ) -> None:
-        folder = tmp_path_factory.mktemp("moment")
-        moment = SavedMoment(request(label), pending, tuple(missing))
-        write_saved_moment(folder, moment)
-        assert read_saved_moment(folder) == moment
-        complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]
-        assert complete == (not pending and not missing)
+def test_moments_of_one_label_and_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    names = [make_moment_folder(tmp_path, request()).name for _ in range(3)]
+    assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
 
-    @pytest.mark.parametrize(
-        "text",
-        [
-            "",
-            "[]",
-            "[" * 100_000,
-            '{"format": 2}',
-            '{"format": 1}',
-            json.dumps({**request().to_json(), "end_ns": 4, "pending": False, "missing": []}),
-        ],
-    )
-    def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
-        folder = make_moment_folder(tmp_path, request())
-        (folder / MOMENT_FILE).write_text(text)
-        assert read_saved_moment(folder) is None
-        assert list(stored_moments_in(tmp_path)) == []
+
+@given(st.text(max_size=130))
+def test_any_label_names_a_folder_that_is_safe(label: str) -> None:
+    name = folder_name(request(label))
+    assert re.fullmatch(r"20261120T050000Z-[a-z0-9]+(-[a-z0-9]+)*", name)
+    assert bag_kind(name) is None
+    assert len(name) < 64
+
+
+@given(
+    st.text(min_size=1, max_size=120).filter(lambda text: not fault_of_label(text)),
+    st.booleans(),
+    st.lists(st.text(st.characters(exclude_categories=["Cs"])), max_size=3),
+)
+def test_what_is_written_is_read(
+    tmp_path_factory: pytest.TempPathFactory,
+    label: str,
+    pending: bool,
+    missing: list[str],
+) -> None:
+    folder = tmp_path_factory.mktemp("moment")
+    moment = SavedMoment(request(label), pending, tuple(missing))
+    write_saved_moment(folder, moment)
+    assert read_saved_moment(folder) == moment
+    complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]
+    assert complete == (not pending and not missing)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "[" * 100_000,
+        '{"format": 2}',
+        '{"format": 1}',
+        json.dumps({**request().to_json(), "end_ns": 4, "pending": False, "missing": []}),
+    ],
+)
+def test_what_says_something_else_is_no_moment(tmp_path: Path, text: str) -> None:
+    folder = make_moment_folder(tmp_path, request())
+    (folder / MOMENT_FILE).write_text(text)
+    assert read_saved_moment(folder) is None
+    assert list(stored_moments_in(tmp_path)) == []
 
 
 def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:

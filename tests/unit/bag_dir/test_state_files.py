@@ -376,41 +376,42 @@ def test_where_a_file_cannot_be_read_nothing_is_lost_or_shipped_and_all_is_held_
     assert not read_withheld(tmp_path).holds("copied", "a.mcap")
 
 
-class TestForgotten:
-    """The lake deletes by this file: no line of it may be passed over in silence."""
+# The lake deletes by this file: no line of it may be passed over in silence.
 
-    def test_a_line_is_cut_or_an_error(self, tmp_path: Path) -> None:
-        whole, last = with_checks("\n".join(FORGOTTEN_ROWS)).splitlines(keepends=True)
-        laid(tmp_path, FORGOTTEN, whole + last + last)
-        topics, _ = read_forgettings(tmp_path)
-        for cut in (last[:length] for length in range(len(last) - 1)):
-            laid(tmp_path, FORGOTTEN, whole + cut)
-            if cut.endswith(("]}", '"}')):  # within a name that looks like the end of a line
-                with pytest.raises(ValueError, match="line 2: it is damaged"):
-                    read_forgettings(tmp_path)
-            else:
-                assert read_forgettings(tmp_path) == [topics]
 
-    @pytest.mark.parametrize("at", [0, 1])
-    @pytest.mark.parametrize(
-        ("line", "told"),
-        [
-            ('{"start" 1, "stop": 2, "topics": [], "bags": []}', "it is damaged: "),
-            ("[]", "it is not a JSON object"),
-            ('{"start": "1", "stop": 2}', "start: "),
-            ('{"start": 1, "stop": 2, "topics": ["/a"], "crc32": "00000000"}', "its check"),
-            ('{"start": 1, "stop": 2, "topics": ["/a"]}', "its check"),
-            (with_checks('{"start": 1, "stop": 2}').rstrip(), "it names no topics and no bags"),
-        ],
-    )
-    def test_a_damaged_line_is_an_error_wherever_it_is(
-        self, tmp_path: Path, at: int, line: str, told: str
-    ) -> None:
-        lines = with_checks("\n".join(FORGOTTEN_ROWS)).splitlines()
-        lines[at] = line
-        laid(tmp_path, FORGOTTEN, "".join(f"{each}\n" for each in lines))
-        with pytest.raises(ValueError, match=f"line {at + 1}: {told}"):
-            read_forgettings(tmp_path)
+def test_a_line_is_cut_or_an_error(tmp_path: Path) -> None:
+    whole, last = with_checks("\n".join(FORGOTTEN_ROWS)).splitlines(keepends=True)
+    laid(tmp_path, FORGOTTEN, whole + last + last)
+    topics, _ = read_forgettings(tmp_path)
+    for cut in (last[:length] for length in range(len(last) - 1)):
+        laid(tmp_path, FORGOTTEN, whole + cut)
+        if cut.endswith(("]}", '"}')):  # within a name that looks like the end of a line
+            with pytest.raises(ValueError, match="line 2: it is damaged"):
+                read_forgettings(tmp_path)
+        else:
+            assert read_forgettings(tmp_path) == [topics]
+
+
+@pytest.mark.parametrize("at", [0, 1])
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('{"start" 1, "stop": 2, "topics": [], "bags": []}', "it is damaged: "),
+        ("[]", "it is not a JSON object"),
+        ('{"start": "1", "stop": 2}', "start: "),
+        ('{"start": 1, "stop": 2, "topics": ["/a"], "crc32": "00000000"}', "its check"),
+        ('{"start": 1, "stop": 2, "topics": ["/a"]}', "its check"),
+        (with_checks('{"start": 1, "stop": 2}').rstrip(), "it names no topics and no bags"),
+    ],
+)
+def test_a_damaged_line_is_an_error_wherever_it_is(
+    tmp_path: Path, at: int, line: str, told: str
+) -> None:
+    lines = with_checks("\n".join(FORGOTTEN_ROWS)).splitlines()
+    lines[at] = line
+    laid(tmp_path, FORGOTTEN, "".join(f"{each}\n" for each in lines))
+    with pytest.raises(ValueError, match=f"line {at + 1}: {told}"):
+        read_forgettings(tmp_path)
 
 
 def test_closed_splits_are_flushed_and_then_the_directory_that_names_them(

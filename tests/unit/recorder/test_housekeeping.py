@@ -66,230 +66,228 @@ def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
     return events(captured, event)
 
 
-class TestRetention:
-    @pytest.mark.parametrize("link", [".ros_log", "moments/x"])
-    def test_the_budget_counts_nothing_behind_a_link(self, tmp_path: Path, link: str) -> None:
-        bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
-        first, *_ = recording(bags, "a", 0)
-        total = size_of(bags)
-        elsewhere.mkdir()
-        (elsewhere / "moment.json").write_bytes(bytes(5000))
-        (bags / link).parent.mkdir(exist_ok=True)
-        (bags / link).symlink_to(elsewhere)
-        keeper_of(bags, max_bytes=total).apply()
-        assert first.exists()
+@pytest.mark.parametrize("link", [".ros_log", "moments/x"])
+def test_the_budget_counts_nothing_behind_a_link(tmp_path: Path, link: str) -> None:
+    bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+    first, *_ = recording(bags, "a", 0)
+    total = size_of(bags)
+    elsewhere.mkdir()
+    (elsewhere / "moment.json").write_bytes(bytes(5000))
+    (bags / link).parent.mkdir(exist_ok=True)
+    (bags / link).symlink_to(elsewhere)
+    keeper_of(bags, max_bytes=total).apply()
+    assert first.exists()
 
-    def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
-        self, tmp_path: Path
-    ) -> None:
-        """What rules need is not held by the clock."""
-        old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
-        clock, needed = Mock(return_value=False), bag(tmp_path / "a/a_1.mcap", 10)
-        rules = Mock(restarts=(), needed=lambda _: frozenset({str(needed)}))
-        keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock, watch=lambda _: rules)
-        with capture_logs() as captured:
+
+def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(tmp_path: Path) -> None:
+    """What rules need is not held by the clock."""
+    old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
+    clock, needed = Mock(return_value=False), bag(tmp_path / "a/a_1.mcap", 10)
+    rules = Mock(restarts=(), needed=lambda _: frozenset({str(needed)}))
+    keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock, watch=lambda _: rules)
+    with capture_logs() as captured:
+        keeper.apply()
+        keeper.apply()
+        assert (old.exists(), clock.call_count) == (True, 2)
+        [held] = events(captured, "age_held")
+        assert (held["bags"], held["reason"]) == (1, keeper.status().age_held)
+        assert "1 bag is older than 2 h" in held["reason"]
+        clock.return_value = True
+        keeper.apply()
+    assert (old.exists(), young.exists(), keeper.status().age_held) == (False, True, None)
+    assert len(events(captured, "age_no_longer_held")) == 1
+    keeper.apply()
+    assert clock.call_count == 3
+
+
+def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
+    tmp_path: Path,
+) -> None:
+    old = recording(tmp_path, "a", 0, splits=3)
+    young = recording(tmp_path, "b", 3 * 3600)
+    keeper = keeper_of(tmp_path, max_age_h=2, require_shipped=True)
+    keeper.apply()
+    append_receipts(tmp_path, [receipt(old[0], tmp_path), receipt(old[1], tmp_path, more=1)])
+    keeper.apply()
+    assert [each.exists() for each in old] == [False, True, True]
+    append_receipts(tmp_path, [receipt(each, tmp_path) for each in (*old[1:], young[0])])
+    keeper.apply()
+    assert not (tmp_path / "a").exists()
+    assert all(each.exists() for each in young)
+    assert keeper.status().unshipped is None
+
+
+def test_what_the_budget_deletes_unshipped_is_counted_and_named(tmp_path: Path) -> None:
+    old = recording(tmp_path, "a", 0, splits=3)
+    new = recording(tmp_path, "b", 3 * 3600)
+    append_receipts(tmp_path, [receipt(old[1], tmp_path)])
+    budget = size_of(tmp_path) - sum(path.stat().st_size for path in old)
+    keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=2, require_shipped=True)
+    with capture_logs() as captured:
+        keeper.apply()
+        [applied] = events(captured, "retention_applied")
+        found = (applied["log_level"], applied["bags"], applied["recordings"])
+        assert found == ("info", 3, 1)
+        [lost] = events(captured, "unshipped_deleted")
+        told = (lost["bags"], lost["names"], lost["reason"])
+        assert told == (2, ["a/a_0.mcap", "a/a_2.mcap"], keeper.status().unshipped)
+        assert "2 bags were deleted unshipped" in lost["reason"]
+    assert all(each.exists() for each in new)
+
+
+def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
+    tmp_path: Path,
+) -> None:
+    old = bag(tmp_path / "a/a_0.mcap", 0)
+    keeper = keeper_of(tmp_path, max_age_h=0.1, is_synchronised=lambda: False)
+    keeper.apply()
+    for second in range(400):
+        keeper.note_recorded(["b"], second, float(second))
+        if second == 350:
+            bag(tmp_path / "b/b_0.mcap", 30)
             keeper.apply()
+            assert old.exists()
+    keeper.apply()
+    assert files_in(tmp_path / "b") == ["b_0.mcap"]
+    assert not old.exists()
+
+
+def test_a_bag_goes_with_its_unfinished_compressed_form_and_with_its_journals(
+    tmp_path: Path,
+) -> None:
+    messages = [odom(T0 + n, 1.0, 2.0) for n in range(5)]
+    plain, base = bag(tmp_path / "a/a_0.mcap", 0), write_db3(tmp_path / "a/a_0.db3", messages)
+    packed = zstandard.compress(plain.read_bytes())
+    plain.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
+    for journal in ("a_0.db3-shm", "a_1.db3-shm"):
+        base.with_name(journal).write_bytes(b"")
+    bag(tmp_path / "b/b_0.mcap", 100)
+    keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
+    assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
+
+
+def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(tmp_path: Path) -> None:
+    first, *_ = recording(tmp_path, "a", 0)
+    left_open(tmp_path / "b" / "b_0.mcap", 100)
+    for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_bytes(bytes(5000))
+    recording_now(tmp_path, "b")
+    total = size_of(tmp_path)
+    keeper_of(tmp_path, max_bytes=total).apply()
+    assert first.exists()
+    keeper_of(tmp_path, max_bytes=total - 1).apply()
+    assert not first.exists()
+
+
+def test_never_deleted_is_what_is_no_closed_bag_of_a_recording_or_is_being_written(
+    tmp_path: Path,
+) -> None:
+    bags, outside = tmp_path / "bags", tmp_path / "outside"
+    kept = recording(outside, "x", 0)
+    recording(bags, "a", 0)
+    (bags / "a/notes.txt").write_text("mine")
+    (bags / "a/.hidden.tmp").write_text("mine")
+    bag(bags / "b/b_0.mcap", 50)
+    left_open(bags / "b/b_1.mcap", 60)
+    (bags / "b/handover.json").write_text("{}")
+    (bags / "c").mkdir()
+    (bags / "c/c_0.mcap").write_bytes(b"no bag at all")
+    bag(bags / "z/z_0.mcap", 100)
+    (bags / "z/z_9.mcap").symlink_to(kept[0])
+    (bags / "x").symlink_to(outside / "x", target_is_directory=True)
+    recording_now(bags, "b", clock=later(0))  # though its heartbeat is old
+    keeper_of(bags, max_bytes=1).apply()
+    left = ["a/.hidden.tmp", "a/notes.txt", "b/b_1.mcap", "b/handover.json", "c/c_0.mcap"]
+    left += ["z/z_0.mcap", "z/z_9.mcap"]
+    assert [name for name in files_in(bags) if name.count("/") and name[0] != "x"] == left
+    assert all(path.exists() for path in (*kept, bags / "x" / kept[0].name))
+
+
+def test_never_deleted_is_the_directory_of_a_recording_that_is_being_written(
+    tmp_path: Path,
+) -> None:
+    bag(tmp_path / "a/a_0.mcap", 0)
+    bag(tmp_path / "b/b_0.mcap", 100)
+    recording_now(tmp_path, "a")
+    keeper = keeper_of(tmp_path, max_bytes=1)
+    keeper.apply()
+    assert files_in(tmp_path)[0] == "a"
+    recording_now(tmp_path, "b")
+    keeper.apply()
+    assert files_in(tmp_path)[0] == "b"
+
+
+def test_deletions_that_fail_are_reported_once_and_do_not_stop_the_rest(tmp_path: Path) -> None:
+    stuck = bag(tmp_path / "a/a_0.mcap", 0)
+    recording(tmp_path, "b", 100)
+    keeper = keeper_of(tmp_path, max_bytes=45_000)
+    # As something that is mounted, or immutable.
+    with broken(collect, "remove_bag", errno.EBUSY, where=lambda _, path, *__: path == stuck):
+        (reported,) = said(keeper, "not_deleted")
+    assert reported["path"] == str(stuck)
+    assert "busy" in reported["reason"]
+    assert "b/b_0.mcap" not in files_in(tmp_path)
+    assert size_of(tmp_path) <= 45_000
+
+
+def test_deletions_that_fail_are_written_down_once(tmp_path: Path) -> None:
+    stuck = bag(tmp_path / "a/a_0.mcap", 0)
+    recording(tmp_path, "b", 7200)
+    keeper = keeper_of(tmp_path, max_age_h=1)
+    with broken(collect, "remove_bag", errno.EBUSY, where=lambda _, path, *__: path == stuck):
+        for _ in range(3):
             keeper.apply()
-            assert (old.exists(), clock.call_count) == (True, 2)
-            [held] = events(captured, "age_held")
-            assert (held["bags"], held["reason"]) == (1, keeper.status().age_held)
-            assert "1 bag is older than 2 h" in held["reason"]
-            clock.return_value = True
-            keeper.apply()
-        assert (old.exists(), young.exists(), keeper.status().age_held) == (False, True, None)
-        assert len(events(captured, "age_no_longer_held")) == 1
-        keeper.apply()
-        assert clock.call_count == 3
-
-    def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
-        self, tmp_path: Path
-    ) -> None:
-        old = recording(tmp_path, "a", 0, splits=3)
-        young = recording(tmp_path, "b", 3 * 3600)
-        keeper = keeper_of(tmp_path, max_age_h=2, require_shipped=True)
-        keeper.apply()
-        append_receipts(tmp_path, [receipt(old[0], tmp_path), receipt(old[1], tmp_path, more=1)])
-        keeper.apply()
-        assert [each.exists() for each in old] == [False, True, True]
-        append_receipts(tmp_path, [receipt(each, tmp_path) for each in (*old[1:], young[0])])
-        keeper.apply()
-        assert not (tmp_path / "a").exists()
-        assert all(each.exists() for each in young)
-        assert keeper.status().unshipped is None
-
-    def test_what_the_budget_deletes_unshipped_is_counted_and_named(self, tmp_path: Path) -> None:
-        old = recording(tmp_path, "a", 0, splits=3)
-        new = recording(tmp_path, "b", 3 * 3600)
-        append_receipts(tmp_path, [receipt(old[1], tmp_path)])
-        budget = size_of(tmp_path) - sum(path.stat().st_size for path in old)
-        keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=2, require_shipped=True)
-        with capture_logs() as captured:
-            keeper.apply()
-            [applied] = events(captured, "retention_applied")
-            found = (applied["log_level"], applied["bags"], applied["recordings"])
-            assert found == ("info", 3, 1)
-            [lost] = events(captured, "unshipped_deleted")
-            told = (lost["bags"], lost["names"], lost["reason"])
-            assert told == (2, ["a/a_0.mcap", "a/a_2.mcap"], keeper.status().unshipped)
-            assert "2 bags were deleted unshipped" in lost["reason"]
-        assert all(each.exists() for each in new)
-
-    def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
-        self, tmp_path: Path
-    ) -> None:
-        old = bag(tmp_path / "a/a_0.mcap", 0)
-        keeper = keeper_of(tmp_path, max_age_h=0.1, is_synchronised=lambda: False)
-        keeper.apply()
-        for second in range(400):
-            keeper.note_recorded(["b"], second, float(second))
-            if second == 350:
-                bag(tmp_path / "b/b_0.mcap", 30)
-                keeper.apply()
-                assert old.exists()
-        keeper.apply()
-        assert files_in(tmp_path / "b") == ["b_0.mcap"]
-        assert not old.exists()
-
-    def test_a_bag_goes_with_its_unfinished_compressed_form_and_with_its_journals(
-        self, tmp_path: Path
-    ) -> None:
-        messages = [odom(T0 + n, 1.0, 2.0) for n in range(5)]
-        plain, base = bag(tmp_path / "a/a_0.mcap", 0), write_db3(tmp_path / "a/a_0.db3", messages)
-        packed = zstandard.compress(plain.read_bytes())
-        plain.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
-        for journal in ("a_0.db3-shm", "a_1.db3-shm"):
-            base.with_name(journal).write_bytes(b"")
-        bag(tmp_path / "b/b_0.mcap", 100)
-        keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
-        assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
-
-    def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(
-        self, tmp_path: Path
-    ) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        left_open(tmp_path / "b" / "b_0.mcap", 100)
-        for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
-            (tmp_path / name).parent.mkdir()
-            (tmp_path / name).write_bytes(bytes(5000))
-        recording_now(tmp_path, "b")
-        total = size_of(tmp_path)
-        keeper_of(tmp_path, max_bytes=total).apply()
-        assert first.exists()
-        keeper_of(tmp_path, max_bytes=total - 1).apply()
-        assert not first.exists()
+    assert [row.files for row in DELETED.rows(tmp_path)] == [(stuck.name,)]
+    keeper.apply()
+    assert not stuck.exists()
 
 
-class TestWhatIsNeverDeleted:
-    def test_all_that_is_no_closed_bag_of_a_recording_and_what_is_being_written(
-        self, tmp_path: Path
-    ) -> None:
-        bags, outside = tmp_path / "bags", tmp_path / "outside"
-        kept = recording(outside, "x", 0)
-        recording(bags, "a", 0)
-        (bags / "a/notes.txt").write_text("mine")
-        (bags / "a/.hidden.tmp").write_text("mine")
-        bag(bags / "b/b_0.mcap", 50)
-        left_open(bags / "b/b_1.mcap", 60)
-        (bags / "b/handover.json").write_text("{}")
-        (bags / "c").mkdir()
-        (bags / "c/c_0.mcap").write_bytes(b"no bag at all")
-        bag(bags / "z/z_0.mcap", 100)
-        (bags / "z/z_9.mcap").symlink_to(kept[0])
-        (bags / "x").symlink_to(outside / "x", target_is_directory=True)
-        recording_now(bags, "b", clock=later(0))  # though its heartbeat is old
-        keeper_of(bags, max_bytes=1).apply()
-        left = ["a/.hidden.tmp", "a/notes.txt", "b/b_1.mcap", "b/handover.json", "c/c_0.mcap"]
-        left += ["z/z_0.mcap", "z/z_9.mcap"]
-        assert [name for name in files_in(bags) if name.count("/") and name[0] != "x"] == left
-        assert all(path.exists() for path in (*kept, bags / "x" / kept[0].name))
-
-    def test_the_directory_of_a_recording_that_is_being_written_though_no_bag_is_in_it(
-        self, tmp_path: Path
-    ) -> None:
-        bag(tmp_path / "a/a_0.mcap", 0)
-        bag(tmp_path / "b/b_0.mcap", 100)
-        recording_now(tmp_path, "a")
-        keeper = keeper_of(tmp_path, max_bytes=1)
-        keeper.apply()
-        assert files_in(tmp_path)[0] == "a"
-        recording_now(tmp_path, "b")
-        keeper.apply()
-        assert files_in(tmp_path)[0] == "b"
+def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(tmp_path: Path) -> None:
+    recording(tmp_path, "b", 100, splits=1)
+    (tmp_path / ".episodic").mkdir()
+    (tmp_path / ".episodic/catalogue.sqlite-wal").write_bytes(bytes(4_200_000))
+    keeper = keeper_of(tmp_path, max_bytes=1_000_000)
+    assert keeper.status().counted_bytes is None
+    (reported,) = said(keeper, "budget_not_held")
+    assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
+    status = keeper.status()
+    assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
 
 
-class TestDeletionsThatFail:
-    def test_are_reported_once_and_do_not_stop_the_rest(self, tmp_path: Path) -> None:
-        stuck = bag(tmp_path / "a/a_0.mcap", 0)
-        recording(tmp_path, "b", 100)
-        keeper = keeper_of(tmp_path, max_bytes=45_000)
-        # As something that is mounted, or immutable.
-        with broken(collect, "remove_bag", errno.EBUSY, where=lambda _, path, *__: path == stuck):
-            (reported,) = said(keeper, "not_deleted")
-        assert reported["path"] == str(stuck)
-        assert "busy" in reported["reason"]
-        assert "b/b_0.mcap" not in files_in(tmp_path)
-        assert size_of(tmp_path) <= 45_000
-
-    def test_are_written_down_once(self, tmp_path: Path) -> None:
-        stuck = bag(tmp_path / "a/a_0.mcap", 0)
-        recording(tmp_path, "b", 7200)
-        keeper = keeper_of(tmp_path, max_age_h=1)
-        with broken(collect, "remove_bag", errno.EBUSY, where=lambda _, path, *__: path == stuck):
-            for _ in range(3):
-                keeper.apply()
-        assert [row.files for row in DELETED.rows(tmp_path)] == [(stuck.name,)]
-        keeper.apply()
-        assert not stuck.exists()
-
-    def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, "b", 100, splits=1)
-        (tmp_path / ".episodic").mkdir()
-        (tmp_path / ".episodic/catalogue.sqlite-wal").write_bytes(bytes(4_200_000))
-        keeper = keeper_of(tmp_path, max_bytes=1_000_000)
-        assert keeper.status().counted_bytes is None
-        (reported,) = said(keeper, "budget_not_held")
-        assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
-        status = keeper.status()
-        assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
+def test_where_no_deletion_is_enough_nothing_is_deleted_and_that_is_said_once(
+    tmp_path: Path,
+) -> None:
+    recording(tmp_path, "a", 0)
+    before = files_in(tmp_path)
+    keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
+    with capture_logs() as logs:
+        keeper.make_room(PLENTY)
+        keeper.make_room(PLENTY)
+    assert files_in(tmp_path) == before
+    (told,) = events(logs, "room_out_of_reach")
+    assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
+    assert not events(logs, "budget_not_held")
 
 
-class TestMakingRoom:
-    def test_where_no_deletion_is_enough_nothing_is_deleted_and_that_is_said_once(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, "a", 0)
-        before = files_in(tmp_path)
-        keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
-        with capture_logs() as logs:
-            keeper.make_room(PLENTY)
-            keeper.make_room(PLENTY)
-        assert files_in(tmp_path) == before
-        (told,) = events(logs, "room_out_of_reach")
-        assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
-        assert not events(logs, "budget_not_held")
+def test_room_is_made_while_the_caller_goes_on(tmp_path: Path) -> None:
+    first, *_ = recording(tmp_path, "a", 0)
+    held, asked = threading.Event(), []
 
+    def measured(_directory: Path) -> int:
+        asked.append(held.wait(30))
+        return 0
 
-class TestInTheBackground:
-    def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        held, asked = threading.Event(), []
-
-        def measured(_directory: Path) -> int:
-            asked.append(held.wait(30))
-            return 0
-
-        keeper = keeper_of(tmp_path, background=Background(), measure_free=measured)
-        keeper.make_room(1)
-        keeper.make_room(1)
-        assert keeper.is_making_room()
-        assert first.exists()
-        held.set()
-        keeper.finish()
-        assert not keeper.is_making_room()
-        assert not first.exists()
-        assert all(asked)
+    keeper = keeper_of(tmp_path, background=Background(), measure_free=measured)
+    keeper.make_room(1)
+    keeper.make_room(1)
+    assert keeper.is_making_room()
+    assert first.exists()
+    held.set()
+    keeper.finish()
+    assert not keeper.is_making_room()
+    assert not first.exists()
+    assert all(asked)
 
 
 def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
@@ -319,22 +317,22 @@ def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
     assert asked(memory, "list_recorded_topics") == []
 
 
-class TestRemoval:
-    def test_another_file_in_the_place_of_the_one_looked_at_stays(self, tmp_path: Path) -> None:
-        path = bag(tmp_path / "a/a_0.mcap", 0)
-        status = path.stat()
-        with pytest.raises(OSError, match="not the file that was looked at"):
-            remove_bag(tmp_path, path, (status.st_dev, status.st_ino + 1))
-        assert path.exists()
+def test_another_file_in_the_place_of_the_one_looked_at_stays(tmp_path: Path) -> None:
+    path = bag(tmp_path / "a/a_0.mcap", 0)
+    status = path.stat()
+    with pytest.raises(OSError, match="not the file that was looked at"):
+        remove_bag(tmp_path, path, (status.st_dev, status.st_ino + 1))
+    assert path.exists()
 
-    def test_a_directory_that_became_a_link_is_not_followed(self, tmp_path: Path) -> None:
-        path = bag(tmp_path / "bags/a/a_0.mcap", 0)
-        status = path.stat()
-        (tmp_path / "bags/a").rename(tmp_path / "moved")
-        (tmp_path / "bags/a").symlink_to(tmp_path / "moved", target_is_directory=True)
-        with pytest.raises(OSError, match="behind a symbolic link"):
-            remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
-        assert (tmp_path / "moved/a_0.mcap").exists()
+
+def test_a_directory_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
+    path = bag(tmp_path / "bags/a/a_0.mcap", 0)
+    status = path.stat()
+    (tmp_path / "bags/a").rename(tmp_path / "moved")
+    (tmp_path / "bags/a").symlink_to(tmp_path / "moved", target_is_directory=True)
+    with pytest.raises(OSError, match="behind a symbolic link"):
+        remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
+    assert (tmp_path / "moved/a_0.mcap").exists()
 
 
 @pytest.mark.parametrize(

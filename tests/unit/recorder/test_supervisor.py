@@ -31,173 +31,174 @@ def world(tmp_path: Path) -> World:
     return World(tmp_path).started(3)
 
 
-class TestStart:
-    def test_one_whose_words_for_it_are_not_known_records_once_it_subscribes(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(tmp_path, defaults={"ready_s": 10**9}).started(130)
-        assert world.supervisor.is_recording
-        assert len(world.recorders) == 1
-
-    def test_one_that_cannot_begin_leaves_the_reason_and_nothing_that_looks_begun(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(tmp_path)
-        world.refuse = "no more processes"
-        with pytest.raises(RecorderError, match="no more processes"):
-            world.supervisor.start()
-        beat = world.heartbeat()
-        left = (beat["state"], beat["recordings"], beat["last_error"])
-        assert left == ("stopped", [], "no more processes")
-
-    def test_no_recording_has_the_name_of_one_whose_files_were_deleted(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(tmp_path)
-        name = f"rec_{utc_stamp(world.wall)}"
-        append_deleted(tmp_path, [deleted_of(name, [(f"{name}_0.mcap", 1, 2)])])
-        assert world.started().heartbeat()["recordings"] == [f"{name}_2"]
+def test_a_recorder_whose_words_for_its_start_are_not_known_records_once_it_subscribes(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path, defaults={"ready_s": 10**9}).started(130)
+    assert world.supervisor.is_recording
+    assert len(world.recorders) == 1
 
 
-class TestRotation:
-    def test_a_topic_that_appears_while_both_record_is_waited_for_again(
-        self, tmp_path: Path
-    ) -> None:
-        world = rotating(tmp_path, 24)
-        old, new = world.recorders
-        for recorder in (old, new):
-            recorder.lines.append("[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '/late'")
-            world.run(2)
-        world.run(2.5)
-        assert old.asked_to_end == 0
-        world.run(3)
-        assert old.status == 0
-
-    def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
-        world = rotating(tmp_path, 19)
-        world.defaults = {"topics": ("/bumper",)}
-        [said] = world.logged(12.25, "rotated_without")
-        assert world.recorders[0].status == 0
-        assert "does not subscribe to /door yet" in said["reason"]
-        assert world.heartbeat()["last_error"] is None
-        assert_each_counts_once(world)
-
-    def test_a_split_that_the_old_one_opens_while_it_ends_counts_once(self, tmp_path: Path) -> None:
-        world = rotating(tmp_path, defaults={"obeys_after": 40})
-        world.run(40)
-        assert_each_counts_once(world)
+def test_a_recorder_that_cannot_begin_leaves_the_reason_and_nothing_that_looks_begun(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path)
+    world.refuse = "no more processes"
+    with pytest.raises(RecorderError, match="no more processes"):
+        world.supervisor.start()
+    beat = world.heartbeat()
+    left = (beat["state"], beat["recordings"], beat["last_error"])
+    assert left == ("stopped", [], "no more processes")
 
 
-class TestStop:
-    @pytest.mark.parametrize(
-        ("is_deaf", "after_s"),
-        [
-            *((False, at_s) for at_s in (10.0, 20.5, 21.25, 21.75, 22.5, 23.75, 24.5, 26.0, 26.5)),
-            *((True, at_s) for at_s in (21.25, 22.5, 24.5, 26.5)),
-        ],
-    )
-    def test_at_any_moment_of_a_handover_nothing_is_lost_or_counts_twice(
-        self, tmp_path: Path, after_s: float, is_deaf: bool
-    ) -> None:
-        """Nor is anything hidden that the new one alone has."""
-        world = rotating(tmp_path, after_s - 0.5)
-        world.recorders[0].deaf = is_deaf
-        world.run(0.5)
+def test_no_recording_has_the_name_of_one_whose_files_were_deleted(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    name = f"rec_{utc_stamp(world.wall)}"
+    append_deleted(tmp_path, [deleted_of(name, [(f"{name}_0.mcap", 1, 2)])])
+    assert world.started().heartbeat()["recordings"] == [f"{name}_2"]
+
+
+def test_a_topic_that_appears_while_both_record_is_waited_for_again(tmp_path: Path) -> None:
+    world = rotating(tmp_path, 24)
+    old, new = world.recorders
+    for recorder in (old, new):
+        recorder.lines.append("[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '/late'")
+        world.run(2)
+    world.run(2.5)
+    assert old.asked_to_end == 0
+    world.run(3)
+    assert old.status == 0
+
+
+def test_a_topic_that_went_away_does_not_hold_a_rotation_up_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+    world = rotating(tmp_path, 19)
+    world.defaults = {"topics": ("/bumper",)}
+    [said] = world.logged(12.25, "rotated_without")
+    assert world.recorders[0].status == 0
+    assert "does not subscribe to /door yet" in said["reason"]
+    assert world.heartbeat()["last_error"] is None
+    assert_each_counts_once(world)
+
+
+def test_a_split_that_the_old_recorder_opens_while_it_ends_counts_once(tmp_path: Path) -> None:
+    world = rotating(tmp_path, defaults={"obeys_after": 40})
+    world.run(40)
+    assert_each_counts_once(world)
+
+
+@pytest.mark.parametrize(
+    ("is_deaf", "after_s"),
+    [
+        *((False, at_s) for at_s in (10.0, 20.5, 21.25, 21.75, 22.5, 23.75, 24.5, 26.0, 26.5)),
+        *((True, at_s) for at_s in (21.25, 22.5, 24.5, 26.5)),
+    ],
+)
+def test_a_stop_at_any_moment_of_a_handover_loses_and_doubles_nothing(
+    tmp_path: Path, after_s: float, is_deaf: bool
+) -> None:
+    """Nor is anything hidden that the new one alone has."""
+    world = rotating(tmp_path, after_s - 0.5)
+    world.recorders[0].deaf = is_deaf
+    world.run(0.5)
+    world.supervisor.stop()
+    assert world.running == []
+    (assert_what_stands_counts_once if is_deaf else assert_each_counts_once)(world)
+
+
+@pytest.mark.parametrize("killed", ["old", "new", "all"])
+@pytest.mark.parametrize(
+    ("after_s", "obeys_after"),
+    [(20.5, 1), (21.25, 8), (22.5, 1), (24.0, 8), (25.0, 1), (26.25, 8), (27.5, 1)],
+)
+def test_kills_at_any_moment_of_a_handover_lose_and_double_nothing(
+    tmp_path: Path, after_s: float, obeys_after: int, killed: str
+) -> None:
+    """`all`: the daemon, too; what it left is settled by the next one."""
+    world = rotating(tmp_path)
+    world.recorders[0].obeys_after = obeys_after
+    world.run(after_s)
+    doomed = world.recorders[:1] if killed == "old" else world.recorders[1:]
+    for recorder in world.recorders if killed == "all" else doomed:
+        if recorder.status is None:
+            recorder.die()
+    if killed == "all":
+        before, world = world, World(tmp_path)
+        world.wall = before.wall
+        world.supervisor.start()
+    world.run(12)
+    assert_what_stands_counts_once(world)
+
+
+def test_a_process_that_nothing_ends_is_named(world: World) -> None:
+    [recorder] = world.recorders
+    recorder.obeys_after, recorder.patience_s = 10**9, 0.05
+    with capture_logs() as logs:
         world.supervisor.stop()
-        assert world.running == []
-        (assert_what_stands_counts_once if is_deaf else assert_each_counts_once)(world)
-
-    @pytest.mark.parametrize("killed", ["old", "new", "all"])
-    @pytest.mark.parametrize(
-        ("after_s", "obeys_after"),
-        [(20.5, 1), (21.25, 8), (22.5, 1), (24.0, 8), (25.0, 1), (26.25, 8), (27.5, 1)],
-    )
-    def test_kills_at_any_moment_of_a_handover_lose_and_double_nothing(
-        self, tmp_path: Path, after_s: float, obeys_after: int, killed: str
-    ) -> None:
-        """`all`: the daemon, too; what it left is settled by the next one."""
-        world = rotating(tmp_path)
-        world.recorders[0].obeys_after = obeys_after
-        world.run(after_s)
-        doomed = world.recorders[:1] if killed == "old" else world.recorders[1:]
-        for recorder in world.recorders if killed == "all" else doomed:
-            if recorder.status is None:
-                recorder.die()
-        if killed == "all":
-            before, world = world, World(tmp_path)
-            world.wall = before.wall
-            world.supervisor.start()
-        world.run(12)
-        assert_what_stands_counts_once(world)
-
-    def test_a_process_that_nothing_ends_is_named(self, world: World) -> None:
-        [recorder] = world.recorders
-        recorder.obeys_after, recorder.patience_s = 10**9, 0.05
-        with capture_logs() as logs:
-            world.supervisor.stop()
-        (said,) = events(logs, "recorder_not_ended")
-        assert "process 100" in said["reason"]
+    (said,) = events(logs, "recorder_not_ended")
+    assert "process 100" in said["reason"]
 
 
-class TestMessagesOfOneRecordingAlone:
-    # Publishers on a busy machine discover seconds later who has subscribed.
-    @pytest.mark.parametrize(
-        ("which", "at_s", "deaf_s"), [(0, 21.75, 0.75), (1, 21.75, 0.75), (1, 20.5, 4)]
-    )
-    def test_what_one_missed_in_a_rotation_counts_in_the_other(
-        self, tmp_path: Path, which: int, at_s: float, deaf_s: float
-    ) -> None:
-        world = rotating(tmp_path, at_s)
-        world.recorders[which].deaf = True
-        world.run(deaf_s)
-        world.recorders[which].deaf = False
-        # Compared as soon as the first split of the new one is closed, long before it ends.
-        world.run(15)
-        assert len(world.running) == 1
-        stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
-        counts = world.published(counting=True)
-        assert {counts[at] for at in stands} == {1}
-        assert_each_counts_once(world)
+# Publishers on a busy machine discover seconds later who has subscribed.
+@pytest.mark.parametrize(
+    ("which", "at_s", "deaf_s"), [(0, 21.75, 0.75), (1, 21.75, 0.75), (1, 20.5, 4)]
+)
+def test_what_one_missed_in_a_rotation_counts_in_the_other(
+    tmp_path: Path, which: int, at_s: float, deaf_s: float
+) -> None:
+    world = rotating(tmp_path, at_s)
+    world.recorders[which].deaf = True
+    world.run(deaf_s)
+    world.recorders[which].deaf = False
+    # Compared as soon as the first split of the new one is closed, long before it ends.
+    world.run(15)
+    assert len(world.running) == 1
+    stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
+    counts = world.published(counting=True)
+    assert {counts[at] for at in stands} == {1}
+    assert_each_counts_once(world)
 
 
-class TestClock:
-    def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
-        world = rotating(tmp_path, 22)
-        world.set_clock(-5)
-        world.run(15)
-        world.supervisor.stop()
-        first, second, third = (recorder.directory for recorder in world.recorders)
-        assert read_handover(second).handover.hides_all
-        assert read_handover(first).handover.next == third.name
-        # Some seconds were lived twice, and their publish times stand twice in one recording.
-        lived_s = round(world.mono - 1_000) - 1
-        counts = world.published(counting=True)
-        assert set(counts) == set(world.published(counting=False))
-        assert sum(counts.values()) == pytest.approx(4 * lived_s, abs=4)
+def test_a_clock_that_is_set_back_in_a_handover_has_it_tried_again(tmp_path: Path) -> None:
+    world = rotating(tmp_path, 22)
+    world.set_clock(-5)
+    world.run(15)
+    world.supervisor.stop()
+    first, second, third = (recorder.directory for recorder in world.recorders)
+    assert read_handover(second).handover.hides_all
+    assert read_handover(first).handover.next == third.name
+    # Some seconds were lived twice, and their publish times stand twice in one recording.
+    lived_s = round(world.mono - 1_000) - 1
+    counts = world.published(counting=True)
+    assert set(counts) == set(world.published(counting=False))
+    assert sum(counts.values()) == pytest.approx(4 * lived_s, abs=4)
 
-    @pytest.mark.parametrize(("seconds", "recordings"), [(-100, 1), (-121, 2)])
-    def test_set_back_by_more_than_two_minutes_a_new_recording_begins(
-        self, world: World, seconds: int, recordings: int
-    ) -> None:
-        world.run(7)
-        world.set_clock(seconds)
-        world.run(20)
-        assert len(world.recorders) == recordings
-        assert_what_stands_counts_once(world)
 
-    def test_set_back_while_nothing_records_no_recording_is_cut_short(self, world: World) -> None:
-        world.run(7)
-        world.free = 5
-        world.run(3)
-        world.set_clock(-3600)
-        world.run(3)
-        world.free = 10**12
-        world.run(30)
-        assert len(world.recorders) == 2
-        assert len(world.running) == 1
+@pytest.mark.parametrize(("seconds", "recordings"), [(-100, 1), (-121, 2)])
+def test_a_clock_that_is_set_back_by_more_than_two_minutes_begins_a_new_recording(
+    world: World, seconds: int, recordings: int
+) -> None:
+    world.run(7)
+    world.set_clock(seconds)
+    world.run(20)
+    assert len(world.recorders) == recordings
+    assert_what_stands_counts_once(world)
+
+
+def test_a_clock_that_is_set_back_while_nothing_records_cuts_no_recording_short(
+    world: World,
+) -> None:
+    world.run(7)
+    world.free = 5
+    world.run(3)
+    world.set_clock(-3600)
+    world.run(3)
+    world.free = 10**12
+    world.run(30)
+    assert len(world.recorders) == 2
+    assert len(world.running) == 1
 
 
 UNKNOWN = "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
@@ -207,176 +208,171 @@ SEVERAL_TYPES = (
 )
 
 
-class TestWatch:
-    def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, world: World) -> None:
-        world.run(15)
-        world.silent = True
-        [reported] = world.logged(300, "no_growth")
-        assert world.heartbeat()["last_error"] == reported["reason"]
-        assert len(world.recorders) == 2
-        assert world.recorders[0].status == 0
-        world.silent = False
-        world.run(20)
-        world.silent = True
-        world.run(100)
-        assert len(world.recorders) == 3
-        assert_what_stands_counts_once(world)
-
-    def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
-        self, world: World
-    ) -> None:
-        world.run(5)
-        shutil.rmtree(world.recorders[0].directory)
-        assert len(world.logged(4, "recording_vanished")) == 1
-        assert [recorder.status for recorder in world.recorders] == [0, None]
-        assert world.supervisor.is_recording
-
-    @pytest.mark.parametrize("loser", ["old", "new"])
-    def test_a_directory_that_vanished_in_a_handover_leaves_the_other(
-        self, tmp_path: Path, loser: str
-    ) -> None:
-        world = rotating(tmp_path, 22)
-        old, new = world.recorders
-        shutil.rmtree((old if loser == "old" else new).directory)
-        world.run(2)
-        kept = new if loser == "old" else old
-        assert kept.status is None
-        assert not read_handover(kept.directory).handover.hides_all
-        world.run(20)
-        assert_what_stands_counts_once(world)
-
-    def test_a_warning_that_repeats_is_reported_once_for_each_topic_with_what_it_means(
-        self, world: World
-    ) -> None:
-        with capture_logs() as logs:
-            for _ in range(40):
-                world.recorders[0].lines += map(SEVERAL_TYPES.format, ("/cam1", "/cam2"))
-                world.run(0.5)
-        assert len(events(logs, "several_types")) == 2
-        assert "/cam2" in world.heartbeat()["last_error"]
-        world.recorders[0].lines.append(
-            "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
-            "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
-        )
-        [reported] = world.logged(3, "qos_refused")
-        assert reported["reason"].startswith("/scan: messages of this publisher are not recorded")
-        assert world.heartbeat()["last_error"] == reported["reason"]
-
-    def test_many_other_warnings_hide_no_topic_that_is_not_recorded(self, world: World) -> None:
-        world.recorders[0].lines += [
-            *(f"[WARN] [1.5] [rmw]: Failed to parse the hash of {'x' * n}" for n in range(300)),
-            UNKNOWN,
-        ]
-        assert world.logged(3, "unknown_type")
-
-    @pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
-    def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
-        self, tmp_path: Path, topic: str, found: set[str]
-    ) -> None:
-        """No QoS would fit it, and no new recording subscribes to it while the old one has it."""
-        world = World(tmp_path)
-        world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
-        world.started(6)
-        world.recorders[0].lines.append(SEVERAL_TYPES.format(topic))
-        world.run(40)
-        assert len(world.recorders) == 1
-        losses = read_losses(tmp_path, MIN_NS, MAX_NS)
-        assert {loss.by for loss in losses if loss.topic == topic} == found
+def test_a_robot_that_falls_silent_has_its_last_split_closed_once(world: World) -> None:
+    world.run(15)
+    world.silent = True
+    [reported] = world.logged(300, "no_growth")
+    assert world.heartbeat()["last_error"] == reported["reason"]
+    assert len(world.recorders) == 2
+    assert world.recorders[0].status == 0
+    world.silent = False
+    world.run(20)
+    world.silent = True
+    world.run(100)
+    assert len(world.recorders) == 3
+    assert_what_stands_counts_once(world)
 
 
-class TestHeartbeat:
-    def test_one_that_cannot_be_written_is_reported_once_and_recording_goes_on(
-        self, world: World
-    ) -> None:
-        (world.bag_dir / ".recorder.json.tmp").mkdir()
-        assert len(world.logged(20, "heartbeat_not_written")) == 1
-        assert world.supervisor.is_recording
-
-    def test_bytes_count_recordings_that_ended_too(self, tmp_path: Path) -> None:
-        world = rotating(tmp_path)
-        sizes = []
-        for _ in range(12):
-            world.run(5)
-            sizes.append(world.heartbeat()["bytes_written"])
-        assert sizes == sorted(sizes)
-        on_disk = sum(path.stat().st_size for path in tmp_path.glob("*/*.mcap"))
-        assert abs(sizes[-1] - on_disk) < 20_000
-        assert world.heartbeat()["interval_s"] == 5.0
+def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
+    world: World,
+) -> None:
+    world.run(5)
+    shutil.rmtree(world.recorders[0].directory)
+    assert len(world.logged(4, "recording_vanished")) == 1
+    assert [recorder.status for recorder in world.recorders] == [0, None]
+    assert world.supervisor.is_recording
 
 
-class TestOffers:
-    def test_topics_that_nobody_offers_are_named_once_a_recorder_has_looked(
-        self, tmp_path: Path
-    ) -> None:
-        expected, offered = ("/odom", "/gone", "/bumper"), {"topics": ("/bumper",)}
-        world = World(tmp_path, expected=expected, defaults=dict(offered)).started()
-        assert world.heartbeat()["missing"] == []
-        with capture_logs() as logs:
-            world.run(29)
-            assert world.heartbeat()["missing"] == ["/gone", "/odom"]
-            assert not events(logs, "topic_not_offered")
-            world.run(60)
-        assert [each["topics"] for each in events(logs, "topic_not_offered")] == [
-            ["/gone", "/odom"]
-        ]
-        world.defaults["topics"] = ("/odom",)
-        world.running[0].die()
-        world.run(10)
-        assert world.heartbeat()["missing"] == ["/gone"]
-
-    def test_nodes_that_have_gone_are_reported(
-        self, world: World, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
-        world.run(9)
-        world.silent, world.defaults = True, {"topics": ()}
-        [said] = world.logged(90, "topic_silent")
-        assert said["topics"] == ["/bumper", "/door"]
-        assert world.heartbeat()["silent"] == ["/bumper", "/door"]
+@pytest.mark.parametrize("loser", ["old", "new"])
+def test_a_directory_that_vanished_in_a_handover_leaves_the_other(
+    tmp_path: Path, loser: str
+) -> None:
+    world = rotating(tmp_path, 22)
+    old, new = world.recorders
+    shutil.rmtree((old if loser == "old" else new).directory)
+    world.run(2)
+    kept = new if loser == "old" else old
+    assert kept.status is None
+    assert not read_handover(kept.directory).handover.hides_all
+    world.run(20)
+    assert_what_stands_counts_once(world)
 
 
-class TestWaiting:
-    def test_a_recorder_that_never_received_anything_says_what_it_waits_for(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(
-            tmp_path, split_duration_s=60, advice=lambda: "look at the network", silent=True
-        ).started(58)  # a recording of long splits waits for one of them
-        assert world.heartbeat()["state"] == "recording"
-        [reported] = world.logged(10, "recording_waits")
-        beat = world.heartbeat()
-        assert beat["state"] == "waiting"
-        assert beat["waiting_for"] == reported["reason"]
-        assert "2 topics are subscribed to; look at the network" in beat["waiting_for"]
-        world.silent = False
-        world.run(10)
-        assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
-
-    @pytest.mark.parametrize(
-        ("simulated", "topics", "heard", "expected"),
-        [
-            (True, ("/odom",), (), "/clock"),
-            (False, (), (), "no publisher offers any of the listed topics"),
-            # The recorder's own log is no sign of the robot.
-            (False, ("/rosout",), ("/rosout",), "no publisher offers any of the listed topics"),
-        ],
+def test_a_warning_that_repeats_is_reported_once_for_each_topic_with_what_it_means(
+    world: World,
+) -> None:
+    with capture_logs() as logs:
+        for _ in range(40):
+            world.recorders[0].lines += map(SEVERAL_TYPES.format, ("/cam1", "/cam2"))
+            world.run(0.5)
+    assert len(events(logs, "several_types")) == 2
+    assert "/cam2" in world.heartbeat()["last_error"]
+    world.recorders[0].lines.append(
+        "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
+        "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
     )
-    def test_simulated_time_and_a_wrong_domain_are_told_apart(
-        self,
-        tmp_path: Path,
-        simulated: bool,
-        topics: tuple[str, ...],
-        heard: tuple[str, ...],
-        expected: str,
-    ) -> None:
-        world = World(
-            tmp_path,
-            expected=("/rosout", "/odom"),
-            simulated=simulated,
-            defaults={"topics": topics, "heard": heard},
-        ).started(40)
-        assert world.heartbeat()["state"] == "waiting"
-        assert expected in world.heartbeat()["waiting_for"]
+    [reported] = world.logged(3, "qos_refused")
+    assert reported["reason"].startswith("/scan: messages of this publisher are not recorded")
+    assert world.heartbeat()["last_error"] == reported["reason"]
+
+
+def test_many_other_warnings_hide_no_topic_that_is_not_recorded(world: World) -> None:
+    world.recorders[0].lines += [
+        *(f"[WARN] [1.5] [rmw]: Failed to parse the hash of {'x' * n}" for n in range(300)),
+        UNKNOWN,
+    ]
+    assert world.logged(3, "unknown_type")
+
+
+@pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
+def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
+    tmp_path: Path, topic: str, found: set[str]
+) -> None:
+    """No QoS would fit it, and no new recording subscribes to it while the old one has it."""
+    world = World(tmp_path)
+    world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
+    world.started(6)
+    world.recorders[0].lines.append(SEVERAL_TYPES.format(topic))
+    world.run(40)
+    assert len(world.recorders) == 1
+    losses = read_losses(tmp_path, MIN_NS, MAX_NS)
+    assert {loss.by for loss in losses if loss.topic == topic} == found
+
+
+def test_a_heartbeat_that_cannot_be_written_is_reported_once_and_recording_goes_on(
+    world: World,
+) -> None:
+    (world.bag_dir / ".recorder.json.tmp").mkdir()
+    assert len(world.logged(20, "heartbeat_not_written")) == 1
+    assert world.supervisor.is_recording
+
+
+def test_bytes_in_the_heartbeat_count_recordings_that_ended_too(tmp_path: Path) -> None:
+    world = rotating(tmp_path)
+    sizes = []
+    for _ in range(12):
+        world.run(5)
+        sizes.append(world.heartbeat()["bytes_written"])
+    assert sizes == sorted(sizes)
+    on_disk = sum(path.stat().st_size for path in tmp_path.glob("*/*.mcap"))
+    assert abs(sizes[-1] - on_disk) < 20_000
+    assert world.heartbeat()["interval_s"] == 5.0
+
+
+def test_topics_that_nobody_offers_are_named_once_a_recorder_has_looked(tmp_path: Path) -> None:
+    expected, offered = ("/odom", "/gone", "/bumper"), {"topics": ("/bumper",)}
+    world = World(tmp_path, expected=expected, defaults=dict(offered)).started()
+    assert world.heartbeat()["missing"] == []
+    with capture_logs() as logs:
+        world.run(29)
+        assert world.heartbeat()["missing"] == ["/gone", "/odom"]
+        assert not events(logs, "topic_not_offered")
+        world.run(60)
+    assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/gone", "/odom"]]
+    world.defaults["topics"] = ("/odom",)
+    world.running[0].die()
+    world.run(10)
+    assert world.heartbeat()["missing"] == ["/gone"]
+
+
+def test_nodes_that_have_gone_are_reported(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+    world.run(9)
+    world.silent, world.defaults = True, {"topics": ()}
+    [said] = world.logged(90, "topic_silent")
+    assert said["topics"] == ["/bumper", "/door"]
+    assert world.heartbeat()["silent"] == ["/bumper", "/door"]
+
+
+def test_a_recorder_that_never_received_anything_says_what_it_waits_for(tmp_path: Path) -> None:
+    world = World(
+        tmp_path, split_duration_s=60, advice=lambda: "look at the network", silent=True
+    ).started(58)  # a recording of long splits waits for one of them
+    assert world.heartbeat()["state"] == "recording"
+    [reported] = world.logged(10, "recording_waits")
+    beat = world.heartbeat()
+    assert beat["state"] == "waiting"
+    assert beat["waiting_for"] == reported["reason"]
+    assert "2 topics are subscribed to; look at the network" in beat["waiting_for"]
+    world.silent = False
+    world.run(10)
+    assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
+
+
+@pytest.mark.parametrize(
+    ("simulated", "topics", "heard", "expected"),
+    [
+        (True, ("/odom",), (), "/clock"),
+        (False, (), (), "no publisher offers any of the listed topics"),
+        # The recorder's own log is no sign of the robot.
+        (False, ("/rosout",), ("/rosout",), "no publisher offers any of the listed topics"),
+    ],
+)
+def test_simulated_time_and_a_wrong_domain_are_told_apart(
+    tmp_path: Path,
+    simulated: bool,
+    topics: tuple[str, ...],
+    heard: tuple[str, ...],
+    expected: str,
+) -> None:
+    world = World(
+        tmp_path,
+        expected=("/rosout", "/odom"),
+        simulated=simulated,
+        defaults={"topics": topics, "heard": heard},
+    ).started(40)
+    assert world.heartbeat()["state"] == "waiting"
+    assert expected in world.heartbeat()["waiting_for"]
 
 
 def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> None:
@@ -391,112 +387,111 @@ def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> N
     assert world.heartbeat()["unknown_types"] == ["/arm"]
 
 
-class TestShortfall:
-    """Topics that are offered and not recorded, as the heartbeat has them."""
-
-    def test_a_topic_that_is_offered_and_never_comes_is_named_with_advice(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(
-            tmp_path,
-            session_duration_s=20,
-            advice=lambda: "look at the users",
-            # Services and actions may be unused.
-            defaults={"topics": (*TOPICS, "/go/_action/feedback"), "heard": ("/bumper",)},
-        ).started(25)
-        assert world.heartbeat()["unheard"] == []
-        with capture_logs() as logs:
-            world.run(60)
-        beat = world.heartbeat()
-        assert (beat["state"], beat["unheard"]) == ("recording", ["/door"])
-        assert beat["advice"] == "look at the users"
-        assert [each["topics"] for each in events(logs, "topics_unheard")] == [["/door"]]
-        world.running[-1].heard = ("/bumper", "/door")
-        world.run(15)
-        assert (world.heartbeat()["unheard"], world.heartbeat()["advice"]) == ([], None)
-
-    @pytest.mark.parametrize("still", [("/bumper",), ()])
-    def test_a_regular_topic_that_stops_is_silent_until_it_comes(
-        self, world: World, still: tuple[str, ...]
-    ) -> None:
-        stopped = sorted({*TOPICS} - {*still})
-        for heard, run_s, silent in (
-            (TOPICS, 57, []),
-            (still, 30, stopped),
-            (still, 60, stopped),
-            (TOPICS, 20, []),
-        ):
-            world.defaults["heard"] = heard
-            for recorder in world.running:
-                recorder.heard = heard
-            world.run(run_s)
-            assert world.heartbeat()["fell_silent"] == silent
-
-    def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(
-            tmp_path,
-            split_duration_s=10,
-            required=[Required("/bumper", 3.5)],
-            defaults={"buffers": True},
-        ).started(60)
-        for _ in range(60):
-            world.run(1)
-            beat = world.heartbeat()
-            assert (beat["fell_silent"], beat["unheard"], beat["required_missing"]) == ([], [], [])
-
-    def test_required_topics_are_missed_by_name_and_rate(self, tmp_path: Path) -> None:
-        required = [Required("/bumper", 3.0), Required("/d*", 5.0), Required("/never")]
-        world = World(tmp_path, required=required).started(20)
-        assert world.heartbeat()["required_missing"] == []
-        world.run(40)
-        rate, never = world.heartbeat()["required_missing"]
-        assert rate.startswith("/door: 4")
-        assert rate.endswith("Hz, and 5 are required")
-        assert never == "/never: no publisher offers it"
-        world.running[-1].heard = ("/door",)
-        world.run(30)
-        assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
+# Topics that are offered and not recorded, as the heartbeat has them.
 
 
-class TestChangedList:
-    def test_a_changed_list_begins_a_recording_and_loses_nothing(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
-        world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
-        world.topics_path.write_text("topics: [/bumper, /lidar]\n")
-        with capture_logs() as logs:
-            world.run(15)
-        [changed] = events(logs, "topics_changed")
-        assert changed["added"] == ["/lidar"]
-        assert "/door" in changed["dropped"]
-        assert not events(logs, "rotated_without")
-        beat = world.heartbeat()
-        assert (beat["listed"], beat["subscribed"]) == (["/bumper", "/lidar"],) * 2
-        assert (len(world.recorders), beat["missing"], beat["silent"]) == (2, [], [])
+def test_a_topic_that_is_offered_and_never_comes_is_named_with_advice(tmp_path: Path) -> None:
+    world = World(
+        tmp_path,
+        session_duration_s=20,
+        advice=lambda: "look at the users",
+        # Services and actions may be unused.
+        defaults={"topics": (*TOPICS, "/go/_action/feedback"), "heard": ("/bumper",)},
+    ).started(25)
+    assert world.heartbeat()["unheard"] == []
+    with capture_logs() as logs:
         world.run(60)
-        assert world.heartbeat()["fell_silent"] == []
-        assert len(world.recorders) == 2
-        assert_what_stands_counts_once(world)
+    beat = world.heartbeat()
+    assert (beat["state"], beat["unheard"]) == ("recording", ["/door"])
+    assert beat["advice"] == "look at the users"
+    assert [each["topics"] for each in events(logs, "topics_unheard")] == [["/door"]]
+    world.running[-1].heard = ("/bumper", "/door")
+    world.run(15)
+    assert (world.heartbeat()["unheard"], world.heartbeat()["advice"]) == ([], None)
 
-    def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
-        before, whole = world.heartbeat()["listed"], world.topics_path.read_text()
-        # One that is touched, or written in steps, is the same.
-        for text, run_s in (("topics:\n", 1.5), (whole, 20)):
-            world.topics_path.write_text(text)
-            world.run(run_s)
-        assert world.heartbeat()["last_error"] is None
-        world.topics_path.write_text("topics: [no slash]\n")
-        [refused] = world.logged(30, "topics_refused")
+
+@pytest.mark.parametrize("still", [("/bumper",), ()])
+def test_a_regular_topic_that_stops_is_silent_until_it_comes(
+    world: World, still: tuple[str, ...]
+) -> None:
+    stopped = sorted({*TOPICS} - {*still})
+    for heard, run_s, silent in (
+        (TOPICS, 57, []),
+        (still, 30, stopped),
+        (still, 60, stopped),
+        (TOPICS, 20, []),
+    ):
+        world.defaults["heard"] = heard
+        for recorder in world.running:
+            recorder.heard = heard
+        world.run(run_s)
+        assert world.heartbeat()["fell_silent"] == silent
+
+
+def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(tmp_path: Path) -> None:
+    world = World(
+        tmp_path,
+        split_duration_s=10,
+        required=[Required("/bumper", 3.5)],
+        defaults={"buffers": True},
+    ).started(60)
+    for _ in range(60):
+        world.run(1)
         beat = world.heartbeat()
-        assert beat["list_refused"] == refused["reason"] == beat["last_error"]
-        assert "'no slash' cannot be recorded" in beat["list_refused"]
-        assert (beat["listed"], beat["recovered"], len(world.recorders)) == (before, False, 1)
-        world.topics_path.write_text("topics: [/bumper, /door]\n")
-        world.run(20)
-        beat = world.heartbeat()
-        assert (beat["list_refused"], beat["listed"]) == (None, ["/bumper", "/door"])
+        assert (beat["fell_silent"], beat["unheard"], beat["required_missing"]) == ([], [], [])
+
+
+def test_required_topics_are_missed_by_name_and_rate(tmp_path: Path) -> None:
+    required = [Required("/bumper", 3.0), Required("/d*", 5.0), Required("/never")]
+    world = World(tmp_path, required=required).started(20)
+    assert world.heartbeat()["required_missing"] == []
+    world.run(40)
+    rate, never = world.heartbeat()["required_missing"]
+    assert rate.startswith("/door: 4")
+    assert rate.endswith("Hz, and 5 are required")
+    assert never == "/never: no publisher offers it"
+    world.running[-1].heard = ("/door",)
+    world.run(30)
+    assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
+
+
+def test_a_changed_list_begins_a_recording_and_loses_nothing(tmp_path: Path) -> None:
+    world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
+    world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
+    world.topics_path.write_text("topics: [/bumper, /lidar]\n")
+    with capture_logs() as logs:
+        world.run(15)
+    [changed] = events(logs, "topics_changed")
+    assert changed["added"] == ["/lidar"]
+    assert "/door" in changed["dropped"]
+    assert not events(logs, "rotated_without")
+    beat = world.heartbeat()
+    assert (beat["listed"], beat["subscribed"]) == (["/bumper", "/lidar"],) * 2
+    assert (len(world.recorders), beat["missing"], beat["silent"]) == (2, [], [])
+    world.run(60)
+    assert world.heartbeat()["fell_silent"] == []
+    assert len(world.recorders) == 2
+    assert_what_stands_counts_once(world)
+
+
+def test_a_refused_list_changes_nothing_and_is_named(tmp_path: Path) -> None:
+    world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
+    before, whole = world.heartbeat()["listed"], world.topics_path.read_text()
+    # One that is touched, or written in steps, is the same.
+    for text, run_s in (("topics:\n", 1.5), (whole, 20)):
+        world.topics_path.write_text(text)
+        world.run(run_s)
+    assert world.heartbeat()["last_error"] is None
+    world.topics_path.write_text("topics: [no slash]\n")
+    [refused] = world.logged(30, "topics_refused")
+    beat = world.heartbeat()
+    assert beat["list_refused"] == refused["reason"] == beat["last_error"]
+    assert "'no slash' cannot be recorded" in beat["list_refused"]
+    assert (beat["listed"], beat["recovered"], len(world.recorders)) == (before, False, 1)
+    world.topics_path.write_text("topics: [/bumper, /door]\n")
+    world.run(20)
+    beat = world.heartbeat()
+    assert (beat["list_refused"], beat["listed"]) == (None, ["/bumper", "/door"])
 
 
 def test_a_death_is_told_with_its_time_and_last_words_and_is_past_once_recording_goes_on(

@@ -32,50 +32,51 @@ from tests.support.housekeepers import (
 from tests.support.memories import memory_of
 
 
-class TestRetention:
-    @pytest.mark.parametrize("behind_h", [169, 300])
-    def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
-        made = []
-        for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
-            made.append(bag(tmp_path / name / f"{name}_0.mcap", hours * 3600))
-            list_ended(tmp_path, name)
-        house_of(tmp_path, max_age_h=168, keeps_foreign=True).apply()
-        assert all(path.exists() for path in made)
-        house_of(tmp_path, max_bytes=size_of(tmp_path) * 6 // 10, keeps_foreign=True).apply()
-        assert [path.exists() for path in made] == [False, False, True, True]
+@pytest.mark.parametrize("behind_h", [169, 300])
+def test_a_clock_that_was_behind_deletes_nothing(tmp_path: Path, behind_h: int) -> None:
+    made = []
+    for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
+        made.append(bag(tmp_path / name / f"{name}_0.mcap", hours * 3600))
+        list_ended(tmp_path, name)
+    house_of(tmp_path, max_age_h=168, keeps_foreign=True).apply()
+    assert all(path.exists() for path in made)
+    house_of(tmp_path, max_bytes=size_of(tmp_path) * 6 // 10, keeps_foreign=True).apply()
+    assert [path.exists() for path in made] == [False, False, True, True]
 
-    def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
-        self, tmp_path: Path
-    ) -> None:
-        for at, x in ((T0 - 100 * S, 0.1), (T0 + 100 * S, 0.2)):
-            mounted = tf(at, transform(at, "base_link", "laser", (x, 0, 0)), topic="/tf_static")
-            path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
-            write_mcap(path, [odom(at, 0.0, 0.0), mounted])
-        recording(tmp_path, A, 0)
-        recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        kept(house, tmp_path, 15, 25)
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
 
-        def known() -> Sample:
-            moment = AtTime(at_s=T0 / S + 17)
-            return queries.topic_value(memory, Call(), "/tf_static", moment).sample
+def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
+    tmp_path: Path,
+) -> None:
+    for at, x in ((T0 - 100 * S, 0.1), (T0 + 100 * S, 0.2)):
+        mounted = tf(at, transform(at, "base_link", "laser", (x, 0, 0)), topic="/tf_static")
+        path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
+        write_mcap(path, [odom(at, 0.0, 0.0), mounted])
+    recording(tmp_path, A, 0)
+    recording(tmp_path, B, 3 * 3600)
+    house = house_of(tmp_path, max_age_h=1)
+    kept(house, tmp_path, 15, 25)
+    memory = memory_of(tmp_path, clock=SettableClock(NOW))
 
-        before = known()
-        assert "0.1" in str(before.value)
-        for _ in range(2):
-            house.apply()
-            assert known() == before
-        assert not (tmp_path / A).exists()
+    def known() -> Sample:
+        moment = AtTime(at_s=T0 / S + 17)
+        return queries.topic_value(memory, Call(), "/tf_static", moment).sample
 
-    def test_the_sidecar_of_a_recording_that_goes_on_is_followed(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25)
-        write_handover(tmp_path / A, Handover(notes=("x",)))
+    before = known()
+    assert "0.1" in str(before.value)
+    for _ in range(2):
         house.apply()
-        [sidecar] = (tmp_path / "moments").rglob("handover.json")
-        assert sidecar.samefile(tmp_path / A / "handover.json")
+        assert known() == before
+    assert not (tmp_path / A).exists()
+
+
+def test_the_sidecar_of_a_recording_that_goes_on_is_followed(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0)
+    house = house_of(tmp_path)
+    kept(house, tmp_path, 15, 25)
+    write_handover(tmp_path / A, Handover(notes=("x",)))
+    house.apply()
+    [sidecar] = (tmp_path / "moments").rglob("handover.json")
+    assert sidecar.samefile(tmp_path / A / "handover.json")
 
 
 STEPS = st.lists(

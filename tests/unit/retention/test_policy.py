@@ -76,30 +76,31 @@ def hourly(hours: int, *, until: int = NOW) -> list[StoredBag]:
     return [bag(f"h{ago}", until - ago * HOUR) for ago in range(hours)]
 
 
-class TestAge:
-    def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
-        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
-        held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
-        going = set(names(by_hours(held, budget(1900)).to_delete))
-        assert set(names(expired(held, budget(1900)))) <= going
-        assert "m170" not in going
-        first = min(int(name[1:]) for name in going)
-        left = {each.path for each in minutes} - {f"rec/{name}" for name in going}
-        assert left >= {f"rec/m{ago}" for ago in range(first)}
-        # Of the hour that the plan ends in all go that may.
-        hours = {each.end // HOUR for each in minutes if each.path.rpartition("/")[2] in going}
-        rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
-        assert {each.path for each in rest} <= held.needed
+def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour() -> None:
+    minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
+    held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
+    going = set(names(by_hours(held, budget(1900)).to_delete))
+    assert set(names(expired(held, budget(1900)))) <= going
+    assert "m170" not in going
+    first = min(int(name[1:]) for name in going)
+    left = {each.path for each in minutes} - {f"rec/{name}" for name in going}
+    assert left >= {f"rec/m{ago}" for ago in range(first)}
+    # Of the hour that the plan ends in all go that may.
+    hours = {each.end // HOUR for each in minutes if each.path.rpartition("/")[2] in going}
+    rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
+    assert {each.path for each in rest} <= held.needed
 
-    def test_a_future_date_has_no_newest_hour(self) -> None:
-        ahead = bag("ahead", NOW + 900 * DAY)
-        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
-        held = contents(*minutes, ahead)
-        assert "m0" not in names(by_hours(held, budget(200)).to_delete)
 
-    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
-        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
-        assert expired(contents(*before, after), LIMITS) == ()
+def test_a_future_date_has_no_newest_hour() -> None:
+    ahead = bag("ahead", NOW + 900 * DAY)
+    minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
+    held = contents(*minutes, ahead)
+    assert "m0" not in names(by_hours(held, budget(200)).to_delete)
+
+
+def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes() -> None:
+    before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+    assert expired(contents(*before, after), LIMITS) == ()
 
 
 def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
@@ -112,33 +113,34 @@ def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
     return replace(contents(*bags, now=now), places={f"r{run}": run for run in range(runs)})
 
 
-class TestBudget:
-    @pytest.mark.parametrize("clock", [2 * HOUR, NOW - 400 * DAY, NOW + 3 * DAY])
-    @pytest.mark.parametrize("deletes", [expired, lambda *given: by_hours(*given).to_delete])
-    def test_what_was_recorded_first_goes_first_whatever_its_clock_said(
-        self, clock: int, deletes: Callable[[DirContents, RetentionLimits], tuple[StoredBag, ...]]
-    ) -> None:
-        for now in (NOW, clock + 240 * S):
-            held = anew(clock, 3, now)
-            assert names(deletes(held, budget(80))) == ["r0_0", "r0_1", "r0_2", "r0_3"]
-            all_but_one = names(deletes(held, budget(0)))
-            assert all_but_one == [f"r{n // 4}_{n % 4}" for n in range(11)]
+@pytest.mark.parametrize("clock", [2 * HOUR, NOW - 400 * DAY, NOW + 3 * DAY])
+@pytest.mark.parametrize("deletes", [expired, lambda *given: by_hours(*given).to_delete])
+def test_what_was_recorded_first_goes_first_whatever_its_clock_said(
+    clock: int, deletes: Callable[[DirContents, RetentionLimits], tuple[StoredBag, ...]]
+) -> None:
+    for now in (NOW, clock + 240 * S):
+        held = anew(clock, 3, now)
+        assert names(deletes(held, budget(80))) == ["r0_0", "r0_1", "r0_2", "r0_3"]
+        all_but_one = names(deletes(held, budget(0)))
+        assert all_but_one == [f"r{n // 4}_{n % 4}" for n in range(11)]
 
-    def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
-        bags = [
-            bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
-            bag("c", NOW - 4 * HOUR),
-            bag("a", NOW + 9000 * DAY, written=NOW - 6 * HOUR),
-            bag("d", NOW - 300 * DAY, written=NOW - 3 * HOUR),
-            bag("e", None, written=NOW - 2 * HOUR),
-            bag("new", NOW),
-        ]
-        limits = replace(LIMITS, max_total_bytes=0)
-        assert names(expired(contents(*bags), limits)) == ["a", "b", "c", "d", "e"]
 
-    def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order(self) -> None:
-        last_hours = hourly(5, until=NOW + 10 * HOUR)
-        assert names(expired(contents(*last_hours), budget(30))) == ["h4", "h3"]
+def test_bags_without_a_date_go_by_the_time_of_their_file() -> None:
+    bags = [
+        bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
+        bag("c", NOW - 4 * HOUR),
+        bag("a", NOW + 9000 * DAY, written=NOW - 6 * HOUR),
+        bag("d", NOW - 300 * DAY, written=NOW - 3 * HOUR),
+        bag("e", None, written=NOW - 2 * HOUR),
+        bag("new", NOW),
+    ]
+    limits = replace(LIMITS, max_total_bytes=0)
+    assert names(expired(contents(*bags), limits)) == ["a", "b", "c", "d", "e"]
+
+
+def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order() -> None:
+    last_hours = hourly(5, until=NOW + 10 * HOUR)
+    assert names(expired(contents(*last_hours), budget(30))) == ["h4", "h3"]
 
 
 def budget(size: int) -> RetentionLimits:
@@ -202,117 +204,119 @@ def fits(held: DirContents, limits: RetentionLimits) -> bool:
     return enough and plan_deletions(held, limits).total_bytes <= limits.max_total_bytes
 
 
-class TestAlways:
-    @given(stocks(), all_limits)
-    def test_the_limits_are_held_by_no_more_than_is_needed_and_something_is_left(
-        self, held: DirContents, limits: RetentionLimits
-    ) -> None:
-        """In whatever order bags are known; what cannot be reached costs none."""
-        plan, going = plan_deletions(held, limits), expired(held, limits)
-        left = without(held, going)
-        assert fits(left, limits) == plan.fits
-        assert (
-            plan.fits or len({each.files for each in left.bags}) <= 1 or plan.most_free is not None
-        )
-        if plan.most_free is not None:
-            assert held.free_bytes is not None
-            assert plan.most_free < limits.min_free_bytes
-            assert going == expired(held, replace(limits, min_free_bytes=0))
-        assert bool(left.bags) == bool(held.bags)
-        dates = [any(each.has_dates for each in some.bags) for some in (left, held)]
-        assert dates[0] == dates[1]
-        aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
-        if deleted := [each for each in going if each not in aged]:
-            spared = [each for each in deleted if each.files != deleted[-1].files]
-            assert not fits(without(held, [*aged, *spared]), limits)
-        assert expired(replace(held, bags=held.bags[::-1]), limits) == going
-        assert expired(left, limits) == ()
+@given(stocks(), all_limits)
+def test_the_limits_are_held_by_no_more_than_is_needed_and_something_is_left(
+    held: DirContents, limits: RetentionLimits
+) -> None:
+    """In whatever order bags are known; what cannot be reached costs none."""
+    plan, going = plan_deletions(held, limits), expired(held, limits)
+    left = without(held, going)
+    assert fits(left, limits) == plan.fits
+    assert plan.fits or len({each.files for each in left.bags}) <= 1 or plan.most_free is not None
+    if plan.most_free is not None:
+        assert held.free_bytes is not None
+        assert plan.most_free < limits.min_free_bytes
+        assert going == expired(held, replace(limits, min_free_bytes=0))
+    assert bool(left.bags) == bool(held.bags)
+    dates = [any(each.has_dates for each in some.bags) for some in (left, held)]
+    assert dates[0] == dates[1]
+    aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
+    if deleted := [each for each in going if each not in aged]:
+        spared = [each for each in deleted if each.files != deleted[-1].files]
+        assert not fits(without(held, [*aged, *spared]), limits)
+    assert expired(replace(held, bags=held.bags[::-1]), limits) == going
+    assert expired(left, limits) == ()
 
-    @given(stocks(), all_limits, st.sets(st.integers(0, 20)))
-    def test_what_is_not_shipped_waits_for_the_budget_alone_which_is_held_all_the_same(
-        self, held: DirContents, limits: RetentionLimits, numbers: set[int]
-    ) -> None:
-        unshipped = frozenset(each.path for n, each in enumerate(held.bags) if n in numbers)
-        waiting = replace(held, unshipped=unshipped)
-        by_age = expired(waiting, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
-        assert unshipped.isdisjoint(each.path for each in by_age)
-        assert set(by_age) <= set(expired(held, limits))
-        assert plan_deletions(waiting, limits).fits == plan_deletions(held, limits).fits
-        lost = [each for each in expired(waiting, limits) if each not in by_age]
-        if lost:
-            spared = [each for each in lost if each.files != lost[-1].files]
-            assert not fits(without(waiting, [*by_age, *spared]), limits)
 
-    @given(
-        st.lists(st.integers(0, 180), min_size=1, max_size=12),
-        st.integers(1, 40),
-        st.sets(st.integers(0, 12)),
+@given(stocks(), all_limits, st.sets(st.integers(0, 20)))
+def test_what_is_not_shipped_waits_for_the_budget_alone_which_is_held_all_the_same(
+    held: DirContents, limits: RetentionLimits, numbers: set[int]
+) -> None:
+    unshipped = frozenset(each.path for n, each in enumerate(held.bags) if n in numbers)
+    waiting = replace(held, unshipped=unshipped)
+    by_age = expired(waiting, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
+    assert unshipped.isdisjoint(each.path for each in by_age)
+    assert set(by_age) <= set(expired(held, limits))
+    assert plan_deletions(waiting, limits).fits == plan_deletions(held, limits).fits
+    lost = [each for each in expired(waiting, limits) if each not in by_age]
+    if lost:
+        spared = [each for each in lost if each.files != lost[-1].files]
+        assert not fits(without(waiting, [*by_age, *spared]), limits)
+
+
+@given(
+    st.lists(st.integers(0, 180), min_size=1, max_size=12),
+    st.integers(1, 40),
+    st.sets(st.integers(0, 12)),
+)
+@example([0, 45, 68], 10, set())  # of the older hour only one is too old, and would be enough
+def test_in_whole_hours_the_limits_are_kept_as_well(
+    minutes_ago: list[int], too_many: int, numbers: set[int]
+) -> None:
+    bags = [bag(f"b{n}", NOW - ago * 60 * S) for n, ago in enumerate(minutes_ago)]
+    needed = frozenset(each.path for n, each in enumerate(bags) if n in numbers)
+    held = replace(contents(*bags), needed=needed)
+    limits = RetentionLimits(10 * len(bags) - too_many, HOUR)
+    plan = by_hours(held, limits)
+    assert fits(without(held, plan.to_delete), limits) == plan.fits
+
+
+@given(stocks(), all_limits, st.integers(0, 400))
+def test_a_larger_budget_deletes_nothing_that_a_smaller_one_keeps(
+    held: DirContents, limits: RetentionLimits, more: int
+) -> None:
+    larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
+    assert set(expired(held, larger)) <= set(expired(held, limits))
+
+
+@given(stocks(), st.lists(moments, min_size=1, max_size=5))
+def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
+    held: DirContents, ends: list[int]
+) -> None:
+    odd = [
+        bag(f"odd{number}", end, written=end, recording="ODD")
+        for number, end in enumerate(ends)
+        if end < 400 * HOUR + 1 or end > NOW
+    ]
+    held = replace(held, now=NOW)
+    more = replace(held, bags=(*held.bags, *odd))
+    # One that is longer than any recording counts as undated, too.
+    dated = (each for each in held.bags if each.end - each.start <= LIMITS.max_age_ns)
+    if any(NOW - 400 * HOUR <= each.end <= NOW for each in dated):
+        assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
+
+
+# `kept` are files of moments, which other names of may be deleted.
+
+
+def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept() -> None:
+    bags = hourly(3)
+    limits = replace(LIMITS, min_free_bytes=10)
+    found = plan_deletions(
+        replace(contents(*bags, free_bytes=0), saved=sizes(bags[-1].files)), limits
     )
-    @example([0, 45, 68], 10, set())  # of the older hour only one is too old, and would be enough
-    def test_in_whole_hours_the_limits_are_kept_as_well(
-        self, minutes_ago: list[int], too_many: int, numbers: set[int]
-    ) -> None:
-        bags = [bag(f"b{n}", NOW - ago * 60 * S) for n, ago in enumerate(minutes_ago)]
-        needed = frozenset(each.path for n, each in enumerate(bags) if n in numbers)
-        held = replace(contents(*bags), needed=needed)
-        limits = RetentionLimits(10 * len(bags) - too_many, HOUR)
-        plan = by_hours(held, limits)
-        assert fits(without(held, plan.to_delete), limits) == plan.fits
-
-    @given(stocks(), all_limits, st.integers(0, 400))
-    def test_a_larger_budget_deletes_nothing_that_a_smaller_one_keeps(
-        self, held: DirContents, limits: RetentionLimits, more: int
-    ) -> None:
-        larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
-        assert set(expired(held, larger)) <= set(expired(held, limits))
-
-    @given(stocks(), st.lists(moments, min_size=1, max_size=5))
-    def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
-        self, held: DirContents, ends: list[int]
-    ) -> None:
-        odd = [
-            bag(f"odd{number}", end, written=end, recording="ODD")
-            for number, end in enumerate(ends)
-            if end < 400 * HOUR + 1 or end > NOW
-        ]
-        held = replace(held, now=NOW)
-        more = replace(held, bags=(*held.bags, *odd))
-        # One that is longer than any recording counts as undated, too.
-        dated = (each for each in held.bags if each.end - each.start <= LIMITS.max_age_ns)
-        if any(NOW - 400 * HOUR <= each.end <= NOW for each in dated):
-            assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
+    assert (names(found.to_delete), found.fits) == (["h1"], True)
 
 
-class TestMoments:
-    """`kept` are files of moments, which other names of may be deleted."""
-
-    def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
-        bags = hourly(3)
-        limits = replace(LIMITS, min_free_bytes=10)
-        found = plan_deletions(
-            replace(contents(*bags, free_bytes=0), saved=sizes(bags[-1].files)), limits
-        )
-        assert (names(found.to_delete), found.fits) == (["h1"], True)
-
-    @given(
-        st.lists(
-            st.tuples(st.integers(0, 200), st.integers(0, 6)),
-            min_size=1,
-            unique_by=lambda drawn: drawn[1],
-        ),
-        st.sets(st.integers(0, 8)),
-        st.integers(0, 120),
-    )
-    def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
-        self, drawn: list[tuple[int, int]], kept: set[int], most: int
-    ) -> None:
-        bags = [
-            bag(f"b{n}", NOW - hours * HOUR, size=10 + inode, inode=inode)
-            for n, (hours, inode) in enumerate(drawn)
-        ]
-        limits = replace(LIMITS, max_total_bytes=most)
-        files = [StoredFile((1, inode), 10 + inode) for inode in kept]
-        found = plan_deletions(replace(contents(*bags), saved=sizes(files)), limits)
-        left = [each for each in bags if each not in found.to_delete]
-        assert found.total_bytes == bytes_of(bags, *files)
-        assert found.fits == (bytes_of(left, *files) <= most)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 200), st.integers(0, 6)),
+        min_size=1,
+        unique_by=lambda drawn: drawn[1],
+    ),
+    st.sets(st.integers(0, 8)),
+    st.integers(0, 120),
+)
+def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
+    drawn: list[tuple[int, int]], kept: set[int], most: int
+) -> None:
+    bags = [
+        bag(f"b{n}", NOW - hours * HOUR, size=10 + inode, inode=inode)
+        for n, (hours, inode) in enumerate(drawn)
+    ]
+    limits = replace(LIMITS, max_total_bytes=most)
+    files = [StoredFile((1, inode), 10 + inode) for inode in kept]
+    found = plan_deletions(replace(contents(*bags), saved=sizes(files)), limits)
+    left = [each for each in bags if each not in found.to_delete]
+    assert found.total_bytes == bytes_of(bags, *files)
+    assert found.fits == (bytes_of(left, *files) <= most)

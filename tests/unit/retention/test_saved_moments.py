@@ -41,99 +41,100 @@ from tests.support.simulated_recorders import events
 FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_size=12)
 
 
-class TestKeeping:
-    def test_the_bags_of_the_moment_are_linked_under_their_names(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        # Both ends are part of it: each of these bags has one.
-        outcome = kept(house_of(tmp_path), tmp_path, 19, 20, "Küche")
-        assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
-        folder = tmp_path / "moments" / str(outcome.moment) / A
-        names = ["handover.json", f"{A}_1.mcap", f"{A}_2.mcap"]
-        assert sorted(path.name for path in folder.iterdir()) == names
-        assert (folder / names[1]).samefile(made[1])
-        reported = told_of(tmp_path)
-        told = [reported[key] for key in ("label", "complete", "missing", "start_ns", "end_ns")]
-        assert told == ["Küche", True, [], T0 + 19 * S, T0 + 20 * S]
-        assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
+def test_the_bags_of_the_moment_are_linked_under_their_names(tmp_path: Path) -> None:
+    made = recording(tmp_path, A, 0)
+    # Both ends are part of it: each of these bags has one.
+    outcome = kept(house_of(tmp_path), tmp_path, 19, 20, "Küche")
+    assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
+    folder = tmp_path / "moments" / str(outcome.moment) / A
+    names = ["handover.json", f"{A}_1.mcap", f"{A}_2.mcap"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    assert (folder / names[1]).samefile(made[1])
+    reported = told_of(tmp_path)
+    told = [reported[key] for key in ("label", "complete", "missing", "start_ns", "end_ns")]
+    assert told == ["Küche", True, [], T0 + 19 * S, T0 + 20 * S]
+    assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
-    @pytest.mark.parametrize("name", [A, os.fsdecode(b"caf\xe9")])
-    def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
-        self, tmp_path: Path, name: str
-    ) -> None:
-        # As `forget`, in another process, deletes beside the recorder.
-        made = recording(tmp_path, name, 0)
-        house = house_of(tmp_path)
-        asked(tmp_path, 15, 25)
-        with house._index.undisturbed() as snapshot:
-            made[1].unlink()
-            house._moments.keep(snapshot)
-        reported = told_of(tmp_path)
-        missing = [f"{name}/{name}_1.mcap is missing, or another file has its name"]
-        assert (reported["complete"], reported["missing"]) == (False, missing)
-        assert len(in_moments(tmp_path)) == 1
 
-    def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(
-        self, tmp_path: Path
-    ) -> None:
-        made = recording(tmp_path, A, 0)
-        house = house_of(tmp_path, moments_bytes=sum(path.stat().st_size for path in made[:3]))
+@pytest.mark.parametrize("name", [A, os.fsdecode(b"caf\xe9")])
+def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
+    tmp_path: Path, name: str
+) -> None:
+    # As `forget`, in another process, deletes beside the recorder.
+    made = recording(tmp_path, name, 0)
+    house = house_of(tmp_path)
+    asked(tmp_path, 15, 25)
+    with house._index.undisturbed() as snapshot:
+        made[1].unlink()
+        house._moments.keep(snapshot)
+    reported = told_of(tmp_path)
+    missing = [f"{name}/{name}_1.mcap is missing, or another file has its name"]
+    assert (reported["complete"], reported["missing"]) == (False, missing)
+    assert len(in_moments(tmp_path)) == 1
 
-        def refusal(start: int, end: int) -> str:
-            return str(kept(house, tmp_path, start, end).refused)
 
-        assert "nothing was recorded then" in refusal(500, 600)
-        with broken(os, "link", errno.EPERM):
-            assert "no hard link can be made: Operation not permitted" in refusal(15, 25)
-        assert not [*(tmp_path / "moments").glob("*")]
-        assert lines(tmp_path) == []
-        # A bag that two moments share counts once in the share.
-        assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
-        assert "retention.max_moments_gb" in refusal(25, 35)
-        assert len(list(stored_moments_in(tmp_path))) == 2
+def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(tmp_path: Path) -> None:
+    made = recording(tmp_path, A, 0)
+    house = house_of(tmp_path, moments_bytes=sum(path.stat().st_size for path in made[:3]))
 
-    def test_a_request_is_not_granted_twice(self, tmp_path: Path) -> None:
-        """As where the recorder was killed after it kept a moment, and before it answered."""
-        recording(tmp_path, A, 0)
-        pending = asked(tmp_path, 15, 25)
-        request = tmp_path / REQUESTS_FOLDER / f"{pending.request.number}.json"
-        text = request.read_text()
-        house_of(tmp_path).keep_moments()
-        first = pending.outcome()
-        pending.close()
-        request.with_suffix(".taken").write_text(text)
-        house_of(tmp_path).keep_moments()
-        assert pending.outcome() == first
-        assert len(list(stored_moments_in(tmp_path))) == 1
+    def refusal(start: int, end: int) -> str:
+        return str(kept(house, tmp_path, start, end).refused)
 
-    def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
-        self, tmp_path: Path
-    ) -> None:
-        made = recording(tmp_path, A, 0)
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 0, 5, "one")
-        made[0].unlink()
-        assert kept(house, tmp_path, 2, 7, "two").bags == 1
-        one, two = in_moments(tmp_path)
-        assert one.partition("/")[2] == two.partition("/")[2] == f"{A}/{A}_0.mcap"
+    assert "nothing was recorded then" in refusal(500, 600)
+    with broken(os, "link", errno.EPERM):
+        assert "no hard link can be made: Operation not permitted" in refusal(15, 25)
+    assert not [*(tmp_path / "moments").glob("*")]
+    assert lines(tmp_path) == []
+    # A bag that two moments share counts once in the share.
+    assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
+    assert "retention.max_moments_gb" in refusal(25, 35)
+    assert len(list(stored_moments_in(tmp_path))) == 2
 
-    def test_moments_behind_a_link_are_neither_made_nor_followed(self, tmp_path: Path) -> None:
-        recording(tmp_path / "bags", A, 0)
-        (tmp_path / "else").mkdir()
-        (tmp_path / "bags/moments").symlink_to(tmp_path / "else")
-        refused = kept(house_of(tmp_path / "bags"), tmp_path / "bags", 0, 5).refused
-        assert "symbolic link" in str(refused)
-        assert files_in(tmp_path / "else") == []
 
-    def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, A, 0)
-        house, moments = house_of(tmp_path), tmp_path / "moments"
-        with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
-            outcome = kept(house, tmp_path, 15, 25)
-        assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
-        assert not list(stored_moments_in(tmp_path))
-        assert lines(tmp_path) == []
+def test_a_request_is_not_granted_twice(tmp_path: Path) -> None:
+    """As where the recorder was killed after it kept a moment, and before it answered."""
+    recording(tmp_path, A, 0)
+    pending = asked(tmp_path, 15, 25)
+    request = tmp_path / REQUESTS_FOLDER / f"{pending.request.number}.json"
+    text = request.read_text()
+    house_of(tmp_path).keep_moments()
+    first = pending.outcome()
+    pending.close()
+    request.with_suffix(".taken").write_text(text)
+    house_of(tmp_path).keep_moments()
+    assert pending.outcome() == first
+    assert len(list(stored_moments_in(tmp_path))) == 1
+
+
+def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
+    tmp_path: Path,
+) -> None:
+    made = recording(tmp_path, A, 0)
+    house = house_of(tmp_path)
+    kept(house, tmp_path, 0, 5, "one")
+    made[0].unlink()
+    assert kept(house, tmp_path, 2, 7, "two").bags == 1
+    one, two = in_moments(tmp_path)
+    assert one.partition("/")[2] == two.partition("/")[2] == f"{A}/{A}_0.mcap"
+
+
+def test_moments_behind_a_link_are_neither_made_nor_followed(tmp_path: Path) -> None:
+    recording(tmp_path / "bags", A, 0)
+    (tmp_path / "else").mkdir()
+    (tmp_path / "bags/moments").symlink_to(tmp_path / "else")
+    refused = kept(house_of(tmp_path / "bags"), tmp_path / "bags", 0, 5).refused
+    assert "symbolic link" in str(refused)
+    assert files_in(tmp_path / "else") == []
+
+
+def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0)
+    house, moments = house_of(tmp_path), tmp_path / "moments"
+    with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
+        outcome = kept(house, tmp_path, 15, 25)
+    assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
+    assert not list(stored_moments_in(tmp_path))
+    assert lines(tmp_path) == []
 
 
 def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
@@ -146,130 +147,129 @@ def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
     return house, clock
 
 
-class TestOpenBags:
-    def test_a_moment_waits_for_the_split_that_is_being_written(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0, splits=2)
-        layout = McapLayout(chunk_size=400, finish=False)
-        open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
-        now = SettableClock(open_one.stat().st_mtime_ns)
-        recording_now(tmp_path, A, clock=now)
-        house = house_of(tmp_path, clock=now)
-        outcome = kept(house, tmp_path, 15, 25, at=now.at)
-        assert (outcome.bags, outcome.pending) == (1, True)
-        assert told_of(tmp_path)["complete"] is False
-        bag(open_one, 20)
-        bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
-        # Another recorder may be the one that goes on with it.
-        house_of(tmp_path, clock=now).keep_moments()
-        names = [name.rpartition("/")[2] for name in in_moments(tmp_path)]
-        assert names == [f"{A}_1.mcap", f"{A}_2.mcap"]
-
-    def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(
-        self, tmp_path: Path
-    ) -> None:
-        size = bag(tmp_path / A / f"{A}_0.mcap", 0).stat().st_size
-        house, clock = waiting(tmp_path, moments_bytes=5 * size // 2)
-        bag(tmp_path / A / f"{A}_2.mcap", 20)
-        clock.at = T0 + 26 * S
-        house.keep_moments()
-        reported = told_of(tmp_path)
-        assert (reported["pending"], reported["complete"]) == (False, False)
-        assert "retention.max_moments_gb" in reported["missing"][0]
-        assert len(in_moments(tmp_path)) == 2
-
-    @pytest.mark.parametrize("stays_full", [False, True])
-    def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_so(
-        self, tmp_path: Path, *, stays_full: bool
-    ) -> None:
-        house, clock = waiting(tmp_path)
-        bag(tmp_path / A / f"{A}_2.mcap", 20)
-
-        with broken(os, "link"), capture_logs() as captured:
-            for second in (26, 86):
-                clock.at = T0 + second * S
-                house.keep_moments()
-                assert told_of(tmp_path)["pending"] is True
-            if stays_full:
-                clock.at += LONGEST_WAIT_NS
-                house.keep_moments()
-        told = events(captured, "moment_not_followed")
-        reason = "no hard link can be made: No space left on device"
-        assert [each["reason"] for each in told] == [reason]
-        house.keep_moments()
-        missing = [f"not all can be saved: {reason}"]
-        assert told_of(tmp_path)["missing"] == (missing if stays_full else [])
-        assert len(in_moments(tmp_path)) == (2 if stays_full else 3)
-
-    def test_before_anything_is_deleted_a_pending_moment_goes_on(self, tmp_path: Path) -> None:
-        """As after a night: the recorder that begins anew repairs and deletes before it records."""
-        _, clock = waiting(tmp_path)
-        layout = McapLayout(chunk_size=400, finish=False)
-        bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
-        # In a moment nothing is repaired: it would be another file than that it was linked to.
-        left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
-        before = left.read_bytes()
-        recording(tmp_path, B, 100, splits=2)
-        clock.at = NOW
-        house_of(tmp_path, clock=clock, max_bytes=1).apply()
-        assert left.read_bytes() == before
-        assert len(in_moments(tmp_path)) == 4
-        assert told_of(tmp_path)["complete"] is True
+def test_a_moment_waits_for_the_split_that_is_being_written(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0, splits=2)
+    layout = McapLayout(chunk_size=400, finish=False)
+    open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+    now = SettableClock(open_one.stat().st_mtime_ns)
+    recording_now(tmp_path, A, clock=now)
+    house = house_of(tmp_path, clock=now)
+    outcome = kept(house, tmp_path, 15, 25, at=now.at)
+    assert (outcome.bags, outcome.pending) == (1, True)
+    assert told_of(tmp_path)["complete"] is False
+    bag(open_one, 20)
+    bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
+    # Another recorder may be the one that goes on with it.
+    house_of(tmp_path, clock=now).keep_moments()
+    names = [name.rpartition("/")[2] for name in in_moments(tmp_path)]
+    assert names == [f"{A}_1.mcap", f"{A}_2.mcap"]
 
 
-class TestCrashes:
-    @pytest.mark.parametrize("step", ["link", "write_saved_moment"])
-    def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
-    ) -> None:
-        """It dies as it makes its second link, or writes what it made for the second time."""
-        recording(tmp_path, A, 0)
-        pending = asked(tmp_path, 15, 25)
-        owner: Any = os if step == "link" else saved_moments
-        done, real = [], getattr(owner, step)
-
-        def killed(*given: Any, **options: Any) -> None:
-            done.append(step)
-            if len(done) == 2:
-                raise KeyboardInterrupt
-            real(*given, **options)
-
-        with monkeypatch.context() as patched:
-            patched.setattr(owner, step, killed)
-            with pytest.raises(KeyboardInterrupt):
-                house_of(tmp_path).keep_moments()
-        house_of(tmp_path).keep_moments()
-        outcome = pending.outcome()
-        assert outcome is not None
-        reported = told_of(tmp_path)
-        assert (reported["pending"], reported["missing"]) == (False, [])
-        assert outcome.bags == len(in_moments(tmp_path)) >= 2
-        assert len(list(stored_moments_in(tmp_path))) == 1
-
-    def test_a_moment_that_cannot_be_written_holds_up_no_other(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        clock = SettableClock(T0 + 19 * S)
-        house = house_of(tmp_path, clock=clock)
-        stuck = kept(house, tmp_path, 0, 25, "stuck", at=clock.at)
-        clock.at = NOW
-        folder = tmp_path / "moments" / str(stuck.moment)
-        (folder / f".{MOMENT_FILE}.tmp").mkdir()
-        with capture_logs() as captured:
-            assert kept(house, tmp_path, 30, 35).bags == 1
-        assert events(captured, "moment_not_written")
+def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(tmp_path: Path) -> None:
+    size = bag(tmp_path / A / f"{A}_0.mcap", 0).stat().st_size
+    house, clock = waiting(tmp_path, moments_bytes=5 * size // 2)
+    bag(tmp_path / A / f"{A}_2.mcap", 20)
+    clock.at = T0 + 26 * S
+    house.keep_moments()
+    reported = told_of(tmp_path)
+    assert (reported["pending"], reported["complete"]) == (False, False)
+    assert "retention.max_moments_gb" in reported["missing"][0]
+    assert len(in_moments(tmp_path)) == 2
 
 
-class TestTheShare:
-    @given(FILES, FILES, st.integers(0, 150))
-    def test_what_is_granted_or_fits_never_passes_it(
-        self, files: list[tuple[int, int]], before: list[tuple[int, int]], share: int
-    ) -> None:
-        moments = Share(share)
-        for file in before:
-            assert (moments.refusal([file]) is None) == moments.take(*file)
-        stored = {**moments.stored}
-        if moments.refusal(files) is None:
-            assert sum({**stored, **dict(files)}.values()) <= share
-        for file in files:
-            moments.take(*file)
-        assert moments.stored.items() >= stored.items()
-        assert sum(moments.stored.values()) <= share
+@pytest.mark.parametrize("stays_full", [False, True])
+def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_so(
+    tmp_path: Path, *, stays_full: bool
+) -> None:
+    house, clock = waiting(tmp_path)
+    bag(tmp_path / A / f"{A}_2.mcap", 20)
+
+    with broken(os, "link"), capture_logs() as captured:
+        for second in (26, 86):
+            clock.at = T0 + second * S
+            house.keep_moments()
+            assert told_of(tmp_path)["pending"] is True
+        if stays_full:
+            clock.at += LONGEST_WAIT_NS
+            house.keep_moments()
+    told = events(captured, "moment_not_followed")
+    reason = "no hard link can be made: No space left on device"
+    assert [each["reason"] for each in told] == [reason]
+    house.keep_moments()
+    missing = [f"not all can be saved: {reason}"]
+    assert told_of(tmp_path)["missing"] == (missing if stays_full else [])
+    assert len(in_moments(tmp_path)) == (2 if stays_full else 3)
+
+
+def test_before_anything_is_deleted_a_pending_moment_goes_on(tmp_path: Path) -> None:
+    """As after a night: the recorder that begins anew repairs and deletes before it records."""
+    _, clock = waiting(tmp_path)
+    layout = McapLayout(chunk_size=400, finish=False)
+    bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+    # In a moment nothing is repaired: it would be another file than that it was linked to.
+    left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
+    before = left.read_bytes()
+    recording(tmp_path, B, 100, splits=2)
+    clock.at = NOW
+    house_of(tmp_path, clock=clock, max_bytes=1).apply()
+    assert left.read_bytes() == before
+    assert len(in_moments(tmp_path)) == 4
+    assert told_of(tmp_path)["complete"] is True
+
+
+@pytest.mark.parametrize("step", ["link", "write_saved_moment"])
+def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """It dies as it makes its second link, or writes what it made for the second time."""
+    recording(tmp_path, A, 0)
+    pending = asked(tmp_path, 15, 25)
+    owner: Any = os if step == "link" else saved_moments
+    done, real = [], getattr(owner, step)
+
+    def killed(*given: Any, **options: Any) -> None:
+        done.append(step)
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        real(*given, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, step, killed)
+        with pytest.raises(KeyboardInterrupt):
+            house_of(tmp_path).keep_moments()
+    house_of(tmp_path).keep_moments()
+    outcome = pending.outcome()
+    assert outcome is not None
+    reported = told_of(tmp_path)
+    assert (reported["pending"], reported["missing"]) == (False, [])
+    assert outcome.bags == len(in_moments(tmp_path)) >= 2
+    assert len(list(stored_moments_in(tmp_path))) == 1
+
+
+def test_a_moment_that_cannot_be_written_holds_up_no_other(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0)
+    clock = SettableClock(T0 + 19 * S)
+    house = house_of(tmp_path, clock=clock)
+    stuck = kept(house, tmp_path, 0, 25, "stuck", at=clock.at)
+    clock.at = NOW
+    folder = tmp_path / "moments" / str(stuck.moment)
+    (folder / f".{MOMENT_FILE}.tmp").mkdir()
+    with capture_logs() as captured:
+        assert kept(house, tmp_path, 30, 35).bags == 1
+    assert events(captured, "moment_not_written")
+
+
+@given(FILES, FILES, st.integers(0, 150))
+def test_what_is_granted_or_fits_never_passes_it(
+    files: list[tuple[int, int]], before: list[tuple[int, int]], share: int
+) -> None:
+    moments = Share(share)
+    for file in before:
+        assert (moments.refusal([file]) is None) == moments.take(*file)
+    stored = {**moments.stored}
+    if moments.refusal(files) is None:
+        assert sum({**stored, **dict(files)}.values()) <= share
+    for file in files:
+        moments.take(*file)
+    assert moments.stored.items() >= stored.items()
+    assert sum(moments.stored.values()) <= share
