@@ -1,9 +1,8 @@
-"""A robot with a privacy mode: `/odom` numbered, at most at 50 Hz; `/privacy_mode`, `/map` latched.
+"""A robot with a privacy mode: `/odom` numbered, at most at 50 Hz; `/privacy_mode` latched.
 
     python -m tests.integration.private_robot TRUTH
 
-SIGUSR1 sets the mode and makes a map, SIGUSR2 ends it, SIGHUP makes a map: the number of the next
-message is then appended to TRUTH, and is that of the map.
+SIGUSR1 sets the mode, SIGUSR2 ends it: the number of the next message is then appended to TRUTH.
 """
 
 import signal
@@ -22,36 +21,24 @@ PERIOD_S = 0.02
 
 def main(truth: Path) -> None:
     """Publishes until the process is killed."""
-    asked: list[signal.Signals] = [signal.SIGUSR2]
-    for sign in (signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP):
-        signal.signal(sign, lambda received, _: asked.append(signal.Signals(received)))
+    asked: list[int] = [signal.SIGUSR2]
+    for sign in (signal.SIGUSR1, signal.SIGUSR2):
+        signal.signal(sign, lambda received, _: asked.append(received))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("private_robot")
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     mode = node.create_publisher(Bool, "/privacy_mode", latched)
-    area = node.create_publisher(PointStamped, "/map", latched)
     odom = node.create_publisher(PointStamped, "/odom", QoSProfile(depth=10))
-    number = 0
+    message = PointStamped()
     while True:
         if asked:
             with truth.open("a") as stream:
-                stream.write(f"{number}\n")
-            wanted = asked.pop(0)
-            if wanted is not signal.SIGHUP:
-                mode.publish(Bool(data=wanted is signal.SIGUSR1))
-            if wanted is not signal.SIGUSR2:
-                area.publish(numbered(number))
-        message = numbered(number)
+                stream.write(f"{message.point.x:.0f}\n")
+            mode.publish(Bool(data=asked.pop(0) == signal.SIGUSR1))
         odom.publish(message)
-        number += 1
+        message.point.x += 1.0
         # What a busy machine delayed is not made up for: so 50 numbers are a second, or more.
         time.sleep(PERIOD_S)
-
-
-def numbered(number: int) -> PointStamped:
-    message = PointStamped()
-    message.point.x = float(number)
-    return message
 
 
 if __name__ == "__main__":

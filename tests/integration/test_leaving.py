@@ -140,11 +140,7 @@ class Listening(Dispatcher):
         name: str,
         given: Mapping[str, object],
         client: Hashable = None,
-        *,
-        for_resource: bool = False,
-        for_page: bool = False,
-        robots: frozenset[str] | None = None,
-        part: object = None,
+        **_: Any,
     ) -> Reply:
         self.asked.append(client)
         return Reply("{}")

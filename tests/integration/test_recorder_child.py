@@ -102,27 +102,21 @@ def is_dead(pid: int) -> bool:
 @pytest.mark.parametrize(
     ("body", "lines"),
     [
-        pytest.param(
+        (
             "print('one', flush=True)\nsys.stderr.write('two\\n')\nprint('three', end='')",
             ["one", "two", "three"],
-            id="both streams, in order",
         ),
-        pytest.param(
-            "sys.stderr.write('x' * 10000)",
-            ["x" * MAX_LINE, "x" * MAX_LINE, "x" * (10000 - 8192)],
-            id="a line without an end, in pieces",
-        ),
-        pytest.param("os.write(2, b'\\xff\\xfe ok\\n')", ["\ufffd\ufffd ok"], id="no text"),
-        pytest.param(
-            "print(sorted(k for k in os.environ if k != 'LC_CTYPE'))",
-            [str(sorted(ENV))],
-            id="the environment that it is given, and nothing else",
-        ),
-        pytest.param(
-            "print(os.getpid() == os.getsid(0) == os.getpgid(0))",
-            ["True"],
-            id="a session and a group of its own",
-        ),
+        ("sys.stderr.write('x' * 10000)", ["x" * MAX_LINE, "x" * MAX_LINE, "x" * (10000 - 8192)]),
+        ("os.write(2, b'\\xff\\xfe ok\\n')", ["\ufffd\ufffd ok"]),
+        ("print(sorted(k for k in os.environ if k != 'LC_CTYPE'))", [str(sorted(ENV))]),
+        ("print(os.getpid() == os.getsid(0) == os.getpgid(0))", ["True"]),
+    ],
+    ids=[
+        "both streams, in order",
+        "a line without an end, in pieces",
+        "no text",
+        "the environment that it is given, and nothing else",
+        "a session and a group of its own",
     ],
 )
 def test_what_it_prints_is_taken_line_by_line(start: Start, body: str, lines: list[str]) -> None:
@@ -178,33 +172,29 @@ def test_it_inherits_its_streams_what_it_is_given_and_nothing_else(
     assert child.take_lines() == ["1 0", "/dev/null"]
 
 
-def test_sigint_ends_it_cleanly(start: Start) -> None:
-    # The signal may come while print() has not returned, which it does not stand twice.
-    child = start(
-        "def end(*_): os.write(1, b'closing\\n'); os._exit(0)\n"
-        "signal.signal(signal.SIGINT, end)\nup()\nidle()"
-    )
-    lines_until(child, "up")
-    assert end_all([child]) == []
-    assert child.exit_status() == 0
-    assert child.take_lines() == ["closing"]
-
-
 @pytest.mark.parametrize(
-    ("ignored", "patience", "status"),
+    ("begin", "patience", "status", "lines"),
     [
-        ("[signal.SIGINT]", DEAF, -signal.SIGTERM),
-        ("[signal.SIGINT, signal.SIGTERM]", DEAFER, -signal.SIGKILL),
+        # The signal may come while print() has not returned, which it does not stand twice.
+        (
+            "def end(*_): os.write(1, b'closing\\n'); os._exit(0)\nsignal.signal(2, end)",
+            PATIENT,
+            0,
+            ["closing"],
+        ),
+        ("signal.signal(signal.SIGINT, signal.SIG_IGN)", DEAF, -signal.SIGTERM, []),
+        ("for n in (2, 15): signal.signal(n, signal.SIG_IGN)", DEAFER, -signal.SIGKILL, []),
     ],
+    ids=["SIGINT", "SIGTERM", "SIGKILL"],
 )
-def test_one_that_does_not_answer_is_ended_by_stronger_signals(
-    start: Start, ignored: str, patience: Patience, status: int
+def test_it_is_ended_by_sigint_and_by_stronger_signals_where_it_does_not_answer(
+    start: Start, begin: str, patience: Patience, status: int, lines: list[str]
 ) -> None:
-    body = f"for s in {ignored}: signal.signal(s, signal.SIG_IGN)\nup()\nidle()"
-    child = start(body, patience=patience)
+    child = start(f"{begin}\nup()\nidle()", patience=patience)
     lines_until(child, "up")
     assert end_all([child]) == []
     assert child.exit_status() == status
+    assert child.take_lines() == lines
 
 
 def test_a_signal_in_the_first_moment_of_its_life_ends_it(start: Start) -> None:

@@ -29,25 +29,24 @@ def setup_file(folder: Path, name: str, text: str) -> Path:
 @pytest.mark.parametrize(
     ("texts", "found"),
     [
-        pytest.param(
+        (
             ["export WAY=distro PYTHONPATH=/ros\n", 'export WAY="$WAY:ws"\n'],
             {"WAY": "distro:ws", "PYTHONPATH": "/ros"},
-            id="in order",
         ),
-        pytest.param(
+        (
             ["export ODD=$'a\\nB=b \\xff end'\n"],
             {"ODD": os.fsdecode(b"a\nB=b \xff end"), "B": None},
-            id="newlines and bytes of any kind",
         ),
-        pytest.param(["export COUNT=$#\n"] * 3, {"COUNT": "0"}, id="no arguments"),
-        pytest.param(
-            ["file=x files=y; export A=1\n", "export B=2\n"],
-            {"A": "1", "B": "2"},
-            id="variables named as the helpers",
-        ),
-        pytest.param(
-            ['export SEEN="${PYTHONPATH-none}"\n'], {"SEEN": "none"}, id="nothing of ours"
-        ),
+        (["export COUNT=$#\n"] * 3, {"COUNT": "0"}),
+        (["file=x files=y; export A=1\n", "export B=2\n"], {"A": "1", "B": "2"}),
+        (['export SEEN="${PYTHONPATH-none}"\n'], {"SEEN": "none"}),
+    ],
+    ids=[
+        "in order",
+        "newlines and bytes of any kind",
+        "no arguments",
+        "variables named as the helpers",
+        "nothing of ours",
     ],
 )
 def test_what_setup_files_set_is_there(

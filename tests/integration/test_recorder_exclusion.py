@@ -4,12 +4,11 @@ import signal
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
-from collections.abc import Set as AbstractSet
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
-import yaml
 from mcap.reader import make_reader
 
 from ros2_memory.bag_dir.state_files import read_withheld
@@ -35,38 +34,18 @@ def robot(site: Machine, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         yield process
 
 
-def numbers(path: Path, topic: str = "/odom") -> AbstractSet[int]:
+def numbers(path: Path) -> frozenset[int]:
     status = path.stat()
-    return numbers_of(path, topic, (status.st_ino, status.st_size, status.st_mtime_ns))
+    return numbers_of(path, (status.st_ino, status.st_size, status.st_mtime_ns))
 
 
 @cache
-def numbers_of(path: Path, topic: str, _state: tuple[int, ...]) -> AbstractSet[int]:
+def numbers_of(path: Path, _state: tuple[int, ...]) -> frozenset[int]:
     """Remembered for each state of a file: all are looked at again and again."""
     with path.open("rb") as stream:
-        found = [each.data for _, _, each in make_reader(stream).iter_messages(topics=[topic])]
+        found = [each.data for _, _, each in make_reader(stream).iter_messages(topics=["/odom"])]
     # After an empty frame_id the point follows at the next multiple of eight.
-    return {int(struct.unpack_from("<d", data, 4 + 16)[0]) for data in found}
-
-
-class Server:
-    """What a query server would find, with the split that is being written."""
-
-    def __init__(self, bag_dir: Path) -> None:
-        self._index = IndexManager(
-            bag_dir,
-            McapReader(),
-            WallClock(),
-            refresh_s=0.1,
-            split_duration_s=2.0,
-            include_active=True,
-        )
-
-    def finds(self, topic: str = "/odom") -> set[int]:
-        found: set[int] = set()
-        for bag in self._index.refresh().bags:
-            found |= numbers(bag.path, topic)
-        return found
+    return frozenset(int(struct.unpack_from("<d", data, 4 + 16)[0]) for data in found)
 
 
 def turned(robot: subprocess.Popen[bytes], truth: Path, sign: signal.Signals) -> int:
@@ -89,11 +68,19 @@ def test_nothing_of_it_is_ever_served(
         "recording.session_duration_s=8",
     )
 
+    def index(bag_dir: Path) -> IndexManager:
+        """What a query server would find, with the split that is being written."""
+        how: dict[str, Any] = {"refresh_s": 0.1, "split_duration_s": 2.0, "include_active": True}
+        return IndexManager(bag_dir, McapReader(), WallClock(), **how)
+
+    def found_by(index: IndexManager) -> set[int]:
+        return set[int]().union(*(numbers(bag.path) for bag in index.refresh().bags))
+
     def served(recorder: LiveRecorder, enough: Callable[[set[int]], bool], what: str) -> None:
-        server = Server(recorder.bag_dir)
+        server = index(recorder.bag_dir)
 
         def is_enough() -> bool:
-            found = server.finds()
+            found = found_by(server)
             assert not {*filter(private.__contains__, found)}, "what is private is served"
             return enough(found)
 
@@ -118,14 +105,14 @@ def test_nothing_of_it_is_ever_served(
     wait_for(has_excluded_a_split, "a split that is excluded", alive=recorder.process)
     recorder.wait_for("rotated", len(recorder.events("rotated")) + 1)
     recorder.kill(with_children=True)
-    assert max(Server(recorder.bag_dir).finds()) < first
+    assert max(found_by(index(recorder.bag_dir))) < first
     recorder = site.record("private", *given, topics=TOPICS)
     wait_for(has_excluded_a_split, "another split that is excluded", alive=recorder.process)
     last = turned(robot, truth, signal.SIGUSR2)
     private = range(first, last)
     served(recorder, lambda found: max(found, default=0) > last + 150, "what came after it")
     recorder.stop()
-    found = Server(recorder.bag_dir).finds()
+    found = found_by(index(recorder.bag_dir))
     # The margin of a second is 50 messages or fewer, which a busy machine receives up to half a
     # second late; all else is there but for what a kill lost.
     assert not found & {*range(first - 20, last + 20)}
@@ -135,60 +122,3 @@ def test_nothing_of_it_is_ever_served(
     assert everywhere == found
     withheld = read_withheld(recorder.bag_dir)
     assert not any(withheld.holds_some(each.name) for each in recorder.bag_dir.glob("rec_*"))
-
-
-def test_a_latched_message_of_an_excluded_time_is_not_asked_for_again(
-    site: Machine, robot: subprocess.Popen[bytes], tmp_path: Path
-) -> None:
-    """Once a screening has seen it. The maps before and after it are in each recording."""
-    rules, truth = tmp_path / "exclusions.yaml", tmp_path / "truth"
-    rules.write_text(RULES)
-    recorder = site.record(
-        "maps",
-        f"recording.exclude_when={rules}",
-        "recording.split_duration_s=2",
-        "recording.session_duration_s=6",
-        topics=(*TOPICS, "/map"),
-    )
-    server = Server(recorder.bag_dir)
-    private: set[int] = set()
-
-    def rotate(times: int, until: Callable[[], bool]) -> list[str]:
-        """Waits for rotations, of which the last ones began when it was so; returns these."""
-        asked: list[str] = []
-        seen = {each["next"] for each in recorder.events("rotation_begun")}
-
-        def is_over() -> bool:
-            assert not private & server.finds("/map"), "a private map is served"
-            for each in recorder.events("rotation_begun"):
-                if each["next"] not in seen:
-                    seen.add(each["next"])
-                    asked[:] = [*asked, each["next"]] if until() else []
-            return len(asked) >= times
-
-        wait_for(is_over, "rotations", timeout_s=2 * PATIENCE_S, alive=recorder.process)
-        recorder.wait_for("rotated", next=asked[-1])
-        return asked
-
-    def asks_for_maps() -> bool:
-        profiles = yaml.safe_load((recorder.bag_dir / "recorder.qos.yaml").read_text())
-        return bool(profiles.get("/map", {}).get("durability") == "transient_local")
-
-    # From when on the mode is known.
-    wait_for(server.finds, "what is served", timeout_s=PATIENCE_S, alive=recorder.process)
-    public = {turned(robot, truth, signal.SIGHUP)}
-    again = rotate(2, asks_for_maps)
-    private = {turned(robot, truth, signal.SIGUSR1)}
-    turned(robot, truth, signal.SIGUSR2)
-    without = rotate(3, lambda: not asks_for_maps())
-    later = turned(robot, truth, signal.SIGHUP)
-    again += rotate(2, asks_for_maps)
-    recorder.stop()
-    assert server.finds("/map") == {*public, later}
-    maps: dict[str, AbstractSet[int]] = {}
-    for bag in recorder.bag_dir.glob("rec_*/*.mcap"):
-        maps[bag.parent.name] = maps.get(bag.parent.name, set()) | numbers(bag, "/map")
-    assert not private & set[int]().union(*maps.values())
-    assert all(maps[name] for name in again)
-    # The last of them may still have recorded when it was made.
-    assert all(maps[name] <= {later} for name in without)

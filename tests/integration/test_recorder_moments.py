@@ -107,6 +107,32 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
     following.stop()
 
 
+RULES = """
+rules:
+  said: {topic: /odom, condition_type: contains, value: "1", before_s: 1, after_s: 1}
+  restarted: {kind: recorder_restart, before_s: 1, after_s: 1}
+"""
+
+
+def test_rules_save_moments_over_a_rotation_and_a_kill(site: Site) -> None:
+    rules = site.folder / "triggers.yaml"
+    rules.write_text(RULES)
+    given = (f"recording.keep_when={rules}", "recording.session_duration_s=3")
+    daemon = site.run(*given)
+    daemon.wait_for("trigger_fired", rule="said")
+    daemon.wait_for("rotated")
+    daemon.kill(with_children=True)
+    following = site.run(*given)
+    following.wait_for("trigger_fired", rule="restarted")
+
+    def complete() -> bool:
+        moments = [held.moment for held in stored_moments_in(site.bag_dir)]
+        return {each.rule for each in moments if not each.pending} == {"said", "restarted"}
+
+    until(complete)
+    following.stop()
+
+
 def _whole(answers: list[Any]) -> list[Any] | None:
     """Answers in which the newest split has its part, too."""
     return answers if "total" in answers[0] and answers[0]["total"] >= 240 else None

@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, groupby, pairwise
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import pytest
 from mcap.reader import make_reader
@@ -39,7 +39,6 @@ PERIOD_S: Final = 0.02
 ROUNDED_S: Final = 2e-6
 """Replies give microseconds."""
 EDGE_S: Final = 2 * PERIOD_S + 0.06
-NEVER: Final = {"condition_type": "above", "field": "position.x", "value": 1e12}
 TOPICS: Final = ("/odom", "/scan", "/slow")
 ROBOTS: Final = {
     "best effort": ("/odom:200:best_effort", "/scan:50:best_effort", "/slow:2:best_effort"),
@@ -218,29 +217,17 @@ def test_each_stall_is_a_gap_and_nothing_else_is(site: Machine, robot: Sequence[
         with answering(found.recorder.bag_dir, site.folder / "server.log") as served:
             gaps = gaps_of(served)
             assert_gaps_are_what_did_not_arrive(found, gaps)
-            assert_replies_name_them(served, gaps)
+            health = json.loads(served.get("/health")[1])["gaps_last_hour"]
+            length_s = sum(end - start for start, end in gaps)
+            assert (health["count"], health["seconds"]) == (
+                len(gaps),
+                pytest.approx(length_s, 1e-3),
+            )
+            for start, end in gaps:
+                told = answer(served, "get_position_at", timestamp=(start + end) / 2)
+                assert told["reason"] == "gap", told
 
     in_time(stalling)
-
-
-def assert_replies_name_them(served: Served, gaps: Sequence[Span]) -> None:
-    status = answer(served, "memory_status")
-    assert sorted((gap["start"], gap["end"]) for gap in status["gaps"]) == gaps
-    health: dict[str, Any] = json.loads(served.get("/health")[1])
-    seconds = sum(end - start for start, end in gaps)
-    assert health["gaps_last_hour"] == {
-        "count": len(gaps),
-        "seconds": pytest.approx(seconds, abs=0.01),
-    }
-    for start, end in gaps:
-        position = answer(served, "get_position_at", timestamp=(start + end) / 2)
-        assert (position["error"], position.get("reason")) == ("no_data", "gap"), position
-        inside = {"start": start + 0.5, "end": end - 0.5}
-        none = answer(served, "find_matches", topic="/odom", **NEVER, **inside)
-        assert (none["error"], none["reason"]) == ("no_data", "gap")
-        around = {"start": start - 1.0, "end": end + 1.0}
-        some = answer(served, "find_matches", topic="/odom", **NEVER, **around)
-        assert [note for note in some["notes"] if f"{start:.6f} to {end:.6f}" in note]
 
 
 def test_a_stall_at_a_rotation_is_a_gap_where_both_recorders_stall(site: Machine) -> None:

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import IO
 
 import anyio
 import pytest
@@ -108,12 +107,10 @@ async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: P
             await ask_everything(client)
             expected = await replies(client)
     with serving(bag_dir, tmp_path / "log") as served:
-        async with Client(served.url("/mcp")) as client:
-            assert await replies(client) == expected
-        async with Client(served.url("/mcp"), mode="legacy") as client:
-            assert await replies(client) == expected
-        async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
-            assert await replies(client) == expected
+        streamed, events = served.url("/mcp"), sse_client(served.url("/sse"), timeout=PATIENCE_S)
+        for each in (Client(streamed), Client(streamed, mode="legacy"), Client(events)):
+            async with each as client:
+                assert await replies(client) == expected
         called = [each for each in served.events() if each["event"] == "tool_call"]
         assert len(called) == 3 * len(CALLS)
         assert all(each["correlation_id"] and each["duration_ms"] > 0 for each in called)
@@ -205,58 +202,34 @@ def stdio_process(bag_dir: Path) -> subprocess.Popen[bytes]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
     )
-    hello = {
-        "jsonrpc": "2.0",
-        "id": 1,
-        "method": "initialize",
-        "params": {
-            "protocolVersion": "2025-06-18",
-            "capabilities": {},
-            "clientInfo": {"name": "test", "version": "1"},
-        },
-    }
     assert process.stdin is not None
     assert process.stdout is not None
-    process.stdin.write(json.dumps(hello).encode() + b"\n")
+    process.stdin.write(opening()[0] + b"\n")
     process.stdin.flush()
     assert json.loads(process.stdout.readline())["result"]["serverInfo"]["name"] == "episodic"
     return process
 
 
-def test_the_end_of_stdin_ends_it_and_nothing_but_the_wire_was_on_stdout(bag_dir: Path) -> None:
-    in_time(lambda: _end_of_stdin(bag_dir))
+@pytest.mark.parametrize("number", [None, signal.SIGINT, *LONG * [signal.SIGTERM]])
+def test_the_end_of_stdin_or_a_signal_ends_it_and_nothing_but_the_wire_was_on_stdout(
+    bag_dir: Path, number: signal.Signals | None
+) -> None:
+    def end() -> None:
+        process = stdio_process(bag_dir)
+        if number:
+            process.send_signal(number)
+            process.wait(timeout=ENDS_WITHIN_S)
+        rest, _ = process.communicate(timeout=ENDS_WITHIN_S)
+        assert (process.returncode, rest) == (0, b"")
 
-
-def _end_of_stdin(bag_dir: Path) -> None:
-    process = stdio_process(bag_dir)
-    rest, _ = process.communicate(timeout=ENDS_WITHIN_S)
-    assert process.returncode == 0
-    assert rest == b""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, *LONG * [signal.SIGTERM]])
-def test_a_signal_ends_it_while_it_waits_for_stdin(bag_dir: Path, number: signal.Signals) -> None:
-    in_time(lambda: _end_while_waiting(bag_dir, number))
-
-
-def _end_while_waiting(bag_dir: Path, number: signal.Signals) -> None:
-    process = stdio_process(bag_dir)
-    process.send_signal(number)
-    assert process.wait(timeout=ENDS_WITHIN_S) == 0
-    rest, _ = process.communicate()
-    assert rest == b""
+    in_time(end)
 
 
 def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> None:
     with service_manager(tmp_path / "notify") as manager:
-        env = {
-            **os.environ,
-            "NOTIFY_SOCKET": str(tmp_path / "notify"),
-            "MEMORY_BAG_DIR": str(tmp_path),
-            "MCP_TRANSPORT": "sse",
-            "MCP_PORT": "0",
-        }
-        argv = [sys.executable, "-m", "ros2_memory.server", "recorder=none"]
+        address = str(tmp_path / "notify")
+        env = environment(tmp_path, NOTIFY_SOCKET=address, MCP_TRANSPORT="sse", MCP_PORT="0")
+        argv = command("recorder=none")
         with subprocess.Popen(argv, env=env, stderr=subprocess.DEVNULL) as server:
             assert manager.recv(100) == b"READY=1"
             server.send_signal(signal.SIGTERM)
@@ -277,9 +250,9 @@ sys.meta_path.insert(0, Interrupting())
 @pytest.mark.parametrize(
     ("program", "module"),
     [
-        pytest.param("ros2-memory", "typer", id="ros2-memory"),
-        pytest.param("ros2-memory-recorder", "structlog", id="recorder"),
-        pytest.param("ros2-memory-server", "structlog", id="server"),
+        ("ros2-memory", "typer"),
+        ("ros2-memory-recorder", "structlog"),
+        ("ros2-memory-server", "structlog"),
     ],
 )
 def test_ctrl_c_while_a_program_imports_ends_it_without_a_traceback(
@@ -311,14 +284,12 @@ LAST = 99
 
 def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     write_run(tmp_path / "bags")
-    ours = ("MEMORY_", "MCP_", "ROS_")
-    env = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
     bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE, *UNPARSED)
     lines = (*bodies, call("data_time_range", "{}", LAST))
     write_command(tmp_path)
     process = subprocess.Popen(
         [str(tmp_path / "ros2-memory-server"), "data.now=latest"],
-        env=env | {"MEMORY_BAG_DIR": str(tmp_path / "bags")},
+        env=environment(tmp_path / "bags"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -327,8 +298,8 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     assert process.stdout is not None
     try:
         # Beside reading: neither pipe takes in all of it at once.
-        written = b"".join(line + b"\n" for line in lines)
-        writer = threading.Thread(target=_write, args=(process.stdin, written))
+        written = [b"".join(line + b"\n" for line in lines)]
+        writer = threading.Thread(target=process.stdin.writelines, args=(written,))
         writer.start()
         replies = []
         for line in process.stdout:
@@ -356,8 +327,3 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     assert "recursion limit" in refused[51]
     assert len(errors) >= 15
     assert set(errors) == {"invalid_arguments"}
-
-
-def _write(pipe: IO[bytes], data: bytes) -> None:
-    pipe.write(data)
-    pipe.flush()

@@ -10,6 +10,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -217,10 +218,10 @@ def test_the_reader_of_a_bag_directory_opens_nothing_beside_it(
     bags: Path, outside: Path, path: str
 ) -> None:
     reader = BagDirReader(McapReader(), bags)
-    with pytest.raises(BagError, match="is not in the bag directory"):
-        reader.summarize(bags / path)
-    with pytest.raises(BagError, match="is not in the bag directory"):
-        reader.newest(bags / path, "/odom", TimeWindow.everything())
+    newest = partial(reader.newest, topic="/odom", window=TimeWindow.everything())
+    for ask in (reader.summarize, newest):
+        with pytest.raises(BagError, match="is not in the bag directory"):
+            ask(bags / path)
 
 
 async def test_the_bag_directory_may_be_a_link_itself(bags: Path, tmp_path: Path) -> None:
@@ -235,7 +236,7 @@ async def test_the_bag_directory_may_be_a_link_itself(bags: Path, tmp_path: Path
 
 
 @pytest.mark.usefixtures("linked")
-def test_a_repair_the_next_start_and_a_wipe_leave_what_a_link_leads_to(
+def test_a_repair_the_next_start_a_wipe_and_recover_leave_what_a_link_leads_to(
     bags: Path, outside: Path
 ) -> None:
     cut = outside / "rec_0.mcap"
@@ -246,6 +247,18 @@ def test_a_repair_the_next_start_and_a_wipe_leave_what_a_link_leads_to(
         recover_files(bags, force=True)
         recover_handovers(bags, McapReader())
         clear_bags(bags)
+    # Through a linked directory that is refused, and the path itself named.
+    (outside / ".rec_9.mcap.repair").write_bytes(b"kept")
+    (bags / "linked").symlink_to(outside)
+    with untouched(outside):
+        assert not remove_if_empty(bags / "linked")
+        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
+            with pytest.raises(RecorderError, match="symbolic link") as refused:
+                recover_files(path, force=True)
+            assert str(path.resolve()) in str(refused.value)
+            if path.suffix:
+                with pytest.raises(BagError, match="behind a symbolic link"):
+                    build_repairer().repair(path)
 
 
 def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
@@ -266,28 +279,11 @@ def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
     assert moved.exists()
 
 
-def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
-    bags: Path, outside: Path
-) -> None:
-    cut = outside / "rec_0.mcap"
-    cut.write_bytes(cut.read_bytes()[:-100])
-    (outside / "rec_9.mcap").touch()
-    (outside / ".rec_9.mcap.repair").write_bytes(b"kept")
-    (bags / "linked").symlink_to(outside)
-    with untouched(outside):
-        assert not remove_if_empty(bags / "linked")
-        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
-            with pytest.raises(RecorderError, match="symbolic link") as refused:
-                recover_files(path, force=True)
-            assert str(path.resolve()) in str(refused.value)
-            if path.suffix:
-                with pytest.raises(BagError, match="behind a symbolic link"):
-                    build_repairer().repair(path)
-
-
-def test_nothing_is_asked_for_or_answered_behind_a_link(bags: Path, outside: Path) -> None:
+def test_nothing_is_asked_for_answered_or_stored_behind_a_link(bags: Path, outside: Path) -> None:
     (outside / "requests").mkdir()
     (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
+    (outside / "columns.sqlite").write_text("somebody's own")
+    (bags / "own").mkdir()
     with untouched(outside):
         (bags / ".episodic").symlink_to(outside)
         with pytest.raises(OSError, match="symbolic link"):
@@ -295,36 +291,25 @@ def test_nothing_is_asked_for_or_answered_behind_a_link(bags: Path, outside: Pat
         queue = RequestQueue(bags)
         queue.open()
         assert not queue.has_requests()
-
-
-def test_a_store_behind_a_link_is_neither_written_nor_set_aside(bags: Path, outside: Path) -> None:
-    (outside / "columns.sqlite").write_text("somebody's own")
-    with untouched(outside):
-        (bags / ".episodic").symlink_to(outside)
-        (bags / "own").mkdir()
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
         for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
             link = bags / "own" / name
             link.symlink_to(outside / "columns.sqlite")
-            refused = open_file([bags / "own" / "columns.sqlite"])
-            assert "symbolic link" in str(refused)
+            assert "symbolic link" in str(open_file([bags / "own" / "columns.sqlite"]))
             link.unlink()
-        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
 
 
-def test_no_sidecar_is_read_through_a_link(bags: Path, outside: Path) -> None:
-    (outside / "other.json").write_text('{"format": 1}')
-    (bags / "run/handover.json").symlink_to(outside / "other.json")
-    (bags / "recorder.json").symlink_to(outside / "other.json")
-    (bags / "run/metadata.yaml").symlink_to(outside / "metadata.yaml")
-    with hearing():
-        assert "symbolic links" in (read_handover(bags / "run").problem or "")
-        assert read_heartbeat(bags).heartbeat is None
-        assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
-
-
-def test_nothing_is_written_through_a_link(bags: Path, outside: Path) -> None:
-    kept = outside / "metadata.yaml"
+def test_no_sidecar_is_read_or_written_through_a_link(bags: Path, outside: Path) -> None:
+    kept, other = outside / "metadata.yaml", outside / "other.json"
+    other.write_text('{"format": 1}')
+    (bags / "run/handover.json").symlink_to(other)
+    (bags / "recorder.json").symlink_to(other)
+    (bags / "run/metadata.yaml").symlink_to(kept)
+    assert "symbolic links" in (read_handover(bags / "run").problem or "")
+    assert read_heartbeat(bags).heartbeat is None
+    assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
     with untouched(outside):
+        (bags / "recorder.json").unlink()
         (bags / ".recorder.json.tmp").symlink_to(kept)
         with pytest.raises(OSError, match="symbolic links"):
             write_durably(bags / "recorder.json", "{}")

@@ -182,12 +182,8 @@ def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
         asked(tmp_path)
-        queue = RequestQueue(tmp_path)
-        [request] = queue.take(T0)
-        taken = tmp_path / REQUESTS_FOLDER / f"{request.number}.taken"
-        assert stat.S_IMODE(taken.stat().st_mode) == 0o644
-        queue.answer(request.number, Outcome(refused="no"))
-        answer = taken.with_suffix(".answer")
-        assert stat.S_IMODE(answer.stat().st_mode) == 0o644
+        refuse_all(RequestQueue(tmp_path))
     finally:
         os.umask(before)
+    files = [*(tmp_path / REQUESTS_FOLDER).iterdir()]
+    assert [stat.S_IMODE(path.stat().st_mode) for path in files] == [0o644] * len(files)

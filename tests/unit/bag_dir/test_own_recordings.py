@@ -258,6 +258,18 @@ def test_after_a_kill_the_next_start_counts_what_was_not_noted(tmp_path: Path) -
     assert not claimed(tmp_path).owns_bag(later)
 
 
+def test_of_an_earlier_version_a_recording_holds_all_that_are_named_after_it(
+    tmp_path: Path,
+) -> None:
+    path, other = (embedding(tmp_path / A / name) for name in (f"{A}_12.mcap", "x_0.mcap"))
+    own = claimed(tmp_path)
+    identity = identity_of(tmp_path / A)
+    assert identity is not None
+    LIST.append(tmp_path, [ListRow(A, identity.inode, identity.generation)])
+    for each in (own, claimed(tmp_path)):
+        assert (each.owns_bag(path), each.owns_bag(other)) == (True, False)
+
+
 def test_an_adopted_folder_holds_what_lay_there_and_one_of_an_earlier_version_everything(
     tmp_path: Path,
 ) -> None:
@@ -267,13 +279,3 @@ def test_an_adopted_folder_holds_what_lay_there_and_one_of_an_earlier_version_ev
     assert (own.owns_bag(path), own.owns_bag(later)) == (True, False)
     LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
     assert OwnRecordings(tmp_path).owns_bag(later)
-
-
-def test_recordings_of_before_such_notes_hold_all_that_are_named_after_them(tmp_path: Path) -> None:
-    path, other = (embedding(tmp_path / A / name) for name in (f"{A}_12.mcap", "x_0.mcap"))
-    own = claimed(tmp_path)
-    identity = identity_of(tmp_path / A)
-    assert identity is not None
-    LIST.append(tmp_path, [ListRow(A, identity.inode, identity.generation)])
-    for each in (own, claimed(tmp_path)):
-        assert (each.owns_bag(path), each.owns_bag(other)) == (True, False)

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from structlog.testing import capture_logs
@@ -12,9 +13,11 @@ from ros2_memory.bag_dir.state_files import append_deleted, deleted_of, read_los
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import handover
+from ros2_memory.recorder.reception import Reception
 from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import (
     TOPICS,
+    PlayedHousekeeper,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -68,6 +71,18 @@ def test_a_topic_that_appears_while_both_record_is_waited_for_again(tmp_path: Pa
     assert old.asked_to_end == 0
     world.run(3)
     assert old.status == 0
+
+
+def test_what_is_excluded_of_latched_topics_is_not_asked_for_by_the_next_recording(
+    tmp_path: Path,
+) -> None:
+    excluded = patch.object(PlayedHousekeeper, "excluded_latched", return_value={"/map"})
+    with excluded, patch.object(Reception, "skip_latched") as skipped:
+        world = rotating(tmp_path, 25)
+        for recorder in world.running:
+            recorder.die()
+        world.run(3)
+    assert [call.args[0] for call in skipped.mock_calls] == [(), {"/map"}, ()]
 
 
 def test_a_topic_that_went_away_does_not_hold_a_rotation_up_for_ever(
@@ -264,13 +279,9 @@ def test_a_warning_that_repeats_is_reported_once_for_each_topic_with_what_it_mea
     [reported] = world.logged(3, "qos_refused")
     assert reported["reason"].startswith("/scan: messages of this publisher are not recorded")
     assert world.heartbeat()["last_error"] == reported["reason"]
-
-
-def test_many_other_warnings_hide_no_topic_that_is_not_recorded(world: World) -> None:
-    world.recorders[0].lines += [
-        *(f"[WARN] [1.5] [rmw]: Failed to parse the hash of {'x' * n}" for n in range(300)),
-        UNKNOWN,
-    ]
+    # Many other warnings hide none.
+    others = [f"[WARN] [1.5] [rmw]: Failed to parse the hash of {'x' * n}" for n in range(300)]
+    world.recorders[0].lines += [*others, UNKNOWN]
     assert world.logged(3, "unknown_type")
 
 

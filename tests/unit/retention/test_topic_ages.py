@@ -36,8 +36,6 @@ from tests.support.simulated_recorders import events
 S = NS_PER_S
 T0 = 1_790_000_400 * S
 NOW = T0 + 30 * HOUR
-PLENTY = 10**15
-SPEECH = (TopicAge("/spee*", 24 * HOUR),)
 
 
 def split(bag_dir: Path, hour: int, *, name: str = "rec_A", first: int = 0) -> Path:
@@ -53,15 +51,16 @@ def split(bag_dir: Path, hour: int, *, name: str = "rec_A", first: int = 0) -> P
     return write_mcap(bag_dir / name / f"{name}_{hour}.mcap", messages)
 
 
-def cutter_of(
+def house(
     bag_dir: Path,
     *,
-    topic_ages: tuple[TopicAge, ...] = SPEECH,
+    topic_ages: tuple[TopicAge, ...] = (TopicAge("/spee*", 24 * HOUR),),
     is_quiet: bool = True,
-    free: int = PLENTY,
+    free: int = 10**15,
     monotonic: Callable[[], float] = lambda: 0.0,
-) -> TopicCutter:
-    return TopicCutter(
+    **how: Any,
+) -> Housekeeping:
+    cutter = TopicCutter(
         bag_dir,
         topic_ages,
         McapReader(),
@@ -71,9 +70,6 @@ def cutter_of(
         measure_free=lambda _: free,
         monotonic=monotonic,
     )
-
-
-def house(bag_dir: Path, cutter: TopicCutter, **how: Any) -> Housekeeping:
     limits: dict[str, Any] = {"max_age_h": 168, "min_free_bytes": 1000, "keeps_foreign": True}
     return keeper_of(bag_dir, clock=SettableClock(NOW), cutter=cutter, **limits, **how)
 
@@ -92,8 +88,12 @@ def bag_dir(tmp_path: Path) -> Path:
     return folder
 
 
-def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
-    house(bag_dir, cutter_of(bag_dir)).apply()
+def test_answers_say_that_it_was_deleted_and_count_it_and_metadata_what_is_left(
+    bag_dir: Path,
+) -> None:
+    assert correct(bag_dir / "rec_A", McapReader())
+    house(bag_dir).apply()
+    assert not correct(bag_dir / "rec_A", McapReader())
     start = T0 / S
     old, young = (
         reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=at, end=at + 9)
@@ -115,7 +115,7 @@ def test_a_topic_of_which_all_messages_were_deleted_is_not_said_to_be_unrecorded
     last = T0 + 30 * HOUR
     write_mcap(bag_dir / "rec_B" / "rec_B_0.mcap", [odom(last + n * S, n, 1.0) for n in range(9)])
     own_all(bag_dir)
-    house(bag_dir, cutter_of(bag_dir, topic_ages=(TopicAge("/speech", HOUR // 2),))).apply()
+    house(bag_dir, topic_ages=(TopicAge("/speech", HOUR // 2),)).apply()
     for topic in ("/speech", "speech"):
         reply = reply_over(
             bag_dir, "find_last_match", topic=topic, condition_type="contains", value="word"
@@ -132,7 +132,7 @@ def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
     write_handover(bag.parent, Handover(next="rec_B", counts_until=until, end=hidden))
     counting = {one.topic for one in BagDirReader(McapReader()).summarize(bag).topics}
     assert "/speech" in counts_of(bag).keys() - counting
-    house(bag_dir, cutter_of(bag_dir)).apply()
+    house(bag_dir).apply()
     assert "/speech" not in counts_of(bag)
     assert counts_of(bag)["/odom"] == 100
 
@@ -144,31 +144,28 @@ def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: P
     (moment / saved.name).hardlink_to(saved)
     foreign = split(bag_dir, 2, name="theirs")
     before = {path: path.read_bytes() for path in (saved, foreign)}
-    everything = (TopicAge("*", 24 * HOUR),)
-    house(bag_dir, cutter_of(bag_dir, topic_ages=everything)).apply()
+    house(bag_dir, topic_ages=(TopicAge("*", 24 * HOUR),)).apply()
     assert {path: path.read_bytes() for path in before} == before
     assert counts_of(bag_dir / "rec_A" / "rec_A_1.mcap") == {"/tf_static": 1}
 
 
 @pytest.mark.parametrize(
     "why",
-    [{"is_quiet": False}, {"free": 1100}, {"synchronised": False}, {"erasing": True}],
+    [{"is_quiet": False}, {"free": 1100}, {"is_synchronised": lambda: False}, {}],
     ids=["busy", "the disk is short", "the clock may be wrong", "messages are forgotten"],
 )
 def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
-    is_synchronised = why.pop("synchronised", True)
-    if why.pop("erasing", False):
+    if not why:
         (bag_dir / ERASING_FILE).write_text("{}")
-    cutter = cutter_of(bag_dir, **why)
-    house(bag_dir, cutter, is_synchronised=lambda: is_synchronised).apply()
+    house(bag_dir, **why).apply()
     assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
     assert not (bag_dir / EXPIRED_FILE).exists()
 
 
 def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> None:
     now_s = [0.0]
-    cutter = cutter_of(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
-    bag, keeper = bag_dir / "rec_A" / "rec_A_0.mcap", house(bag_dir, cutter)
+    keeper = house(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
+    bag = bag_dir / "rec_A" / "rec_A_0.mcap"
     with capture_logs() as logs:
         for now_s[0] in (0.0, PATIENCE_S - 1):
             keeper.apply()
@@ -181,38 +178,32 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
 
 def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
     ticks = iter([0.0, 0.0, 0.5, 1.5, 1.5])
-    house(bag_dir, cutter_of(bag_dir, monotonic=lambda: next(ticks))).apply()
+    house(bag_dir, monotonic=ticks.__next__).apply()
     left = [counts_of(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
     assert ["/speech" in counts for counts in left] == [False, True]
-    house(bag_dir, cutter_of(bag_dir)).apply()
+    house(bag_dir).apply()
     assert "/speech" not in counts_of(bag_dir / "rec_A" / "rec_A_1.mcap")
-
-
-def test_metadata_counts_what_is_left(bag_dir: Path) -> None:
-    assert correct(bag_dir / "rec_A", McapReader())
-    house(bag_dir, cutter_of(bag_dir)).apply()
-    assert not correct(bag_dir / "rec_A", McapReader())
 
 
 def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(
     bag_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(McapWriter, "cut", failing())
-    keeper = house(bag_dir, cutter_of(bag_dir))
+    keeper = house(bag_dir)
     with capture_logs() as logs:
         keeper.apply()
         keeper.apply()
     failed = [log["path"] for log in events(logs, "topics_not_cut")]
     assert failed == [str(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
-    assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
+    assert lost(bag_dir) == []
 
 
 def test_what_a_kill_interrupted_is_counted_once(bag_dir: Path) -> None:
     with killed_at(McapWriter, "cut"):
-        house(bag_dir, cutter_of(bag_dir)).apply()
-    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
-    house(bag_dir, cutter_of(bag_dir)).apply()
-    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
+        house(bag_dir).apply()
+    assert lost(bag_dir) == [10]
+    house(bag_dir).apply()
+    assert lost(bag_dir) == [10, 10]
     assert not [*bag_dir.glob("rec_A/.*")]
 
 
@@ -220,7 +211,7 @@ def test_a_bag_that_another_program_rewrites_is_left_to_it(bag_dir: Path) -> Non
     bag = bag_dir / "rec_A" / "rec_A_0.mcap"
     with bag.open("rb") as held, capture_logs() as logs:
         fcntl.flock(held, fcntl.LOCK_EX)
-        house(bag_dir, cutter_of(bag_dir)).apply()
+        house(bag_dir).apply()
     [told] = events(logs, "topics_not_cut")
     assert "another program rewrites it" in told["reason"]
     assert counts_of(bag)["/speech"] == 10
@@ -235,6 +226,10 @@ def shipped(bag_dir: Path) -> Path:
     return path
 
 
+def lost(bag_dir: Path) -> list[int]:
+    return [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
+
+
 def is_shipped(path: Path) -> bool:
     bag = ("rec_A/rec_A_0.mcap", path.stat().st_size)
     return not unshipped(path.parents[1], [bag])
@@ -244,7 +239,7 @@ def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(
     bag_dir: Path, shipped: Path
 ) -> None:
     old = [shipped, shipped.with_name("rec_A_1.mcap")]
-    house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    house(bag_dir, require_shipped=True).apply()
     assert ["/speech" in counts_of(path) for path in old] == [False, True]
     assert is_shipped(shipped)
 
@@ -256,11 +251,11 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
 
     owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
     with broken(owner, name):
-        house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+        house(bag_dir, require_shipped=True).apply()
     assert counts_of(shipped)["/speech"] == 10
     assert is_shipped(shipped)
-    assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
-    house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    assert lost(bag_dir) == []
+    house(bag_dir, require_shipped=True).apply()
     assert "/speech" not in counts_of(shipped)
     assert is_shipped(shipped)
 
@@ -269,7 +264,7 @@ def test_what_went_stays_written_down_where_the_folder_cannot_be_flushed_afterwa
     bag_dir: Path, shipped: Path
 ) -> None:
     with broken(repair, "flush", errno.EIO):
-        house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+        house(bag_dir, require_shipped=True).apply()
     assert "/speech" not in counts_of(shipped)
-    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
+    assert lost(bag_dir) == [10]
     assert is_shipped(shipped)

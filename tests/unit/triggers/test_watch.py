@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, TRIGGERS_FILE
+from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.triggers.rules import Rule
@@ -297,11 +297,3 @@ def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(
         robot.split(said, layout=LATCHED)
         robot.close_all()
     assert len(robot.fired_at()) == 3
-
-
-def test_a_link_in_place_of_moments_is_named(robot: WatchedBags, tmp_path: Path) -> None:
-    (robot.bag_dir / MOMENTS_FOLDER).symlink_to(tmp_path)
-    robot.begin(T0)
-    robot.split(seconds(0, 10, {6}))
-    robot.close_all()
-    assert "is a symbolic link" in (robot.record().problem or "")
