@@ -10,7 +10,6 @@ from typing import Any, Final
 import anyio
 import pytest
 from mcp import Client
-from mcp.types import TextResourceContents
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
@@ -208,19 +207,11 @@ class Robot:
 
         return anyio.run(called)
 
-    def view(self) -> str:
-        async def read() -> str:
-            async with Client(self.server) as client:
-                [content] = (await client.read_resource(VIEW_URI)).contents
-                assert isinstance(content, TextResourceContents)
-                return content.text
-
-        return anyio.run(read)
-
     def ask(self, host: ChatHost, tool: str, given: dict[str, Any], **how: Any) -> dict[str, Any]:
         """A call whose result the host shows; returns the reply."""
         result = self.call(tool, given)
-        host.show(self.view(), given, result, tool=tool, **how)
+        [view] = anyio.run(self.server.read_resource, VIEW_URI)
+        host.show(str(view.content), given, result, tool=tool, **how)
         reply: dict[str, Any] = json.loads(result["content"][0]["text"])
         return reply
 
@@ -262,12 +253,8 @@ def test_what_is_drawn_is_the_reply_itself(robot: Robot, host: ChatHost, chromiu
     path = robot.ask(host, "trajectory_summary", CALLS["trajectory_summary"])
     drawn(chromium)
     corners = [[point["timestamp"], point["x"], point["y"]] for point in path["waypoints"]]
-    assert (
-        chromium.run(
-            "return map.paths[0].t.map((t, n) => [t, map.paths[0].x[n], map.paths[0].y[n]])"
-        )
-        == corners
-    )
+    shown = "return map.paths[0].t.map((t, n) => [t, map.paths[0].x[n], map.paths[0].y[n]])"
+    assert chromium.run(shown) == corners
     found = robot.ask(host, "find_things", {})
     drawn(chromium)
     places = [
@@ -281,11 +268,16 @@ def test_what_is_drawn_is_the_reply_itself(robot: Robot, host: ChatHost, chromiu
     ]
 
 
-def test_a_click_asks_further_through_the_host(
+def test_the_height_follows_the_content_and_a_click_asks_further_through_the_host(
     robot: Robot, host: ChatHost, chromium: Browser
 ) -> None:
     robot.ask(host, "recap", SPAN)
     drawn(chromium)
+    height = "return Math.ceil(document.documentElement.getBoundingClientRect().height)"
+    high = chromium.run(height)
+    chromium.leave_frames()
+    chromium.awaits("return proxy.clientHeight === arguments[0]", high)
+    host.enter()
     assert chromium.run("return map.paths[0].t.length") == 0
     chromium.run("document.querySelectorAll('#more button')[1].click()")
     asked = host.await_heard("tools/call")
@@ -339,16 +331,6 @@ def test_nothing_leaves_whatever_the_host_allows(
     assert set(chromium.run("return broken")) == {"enforce"}
     with pytest.raises(AssertionError, match="TrustedHTML"):
         chromium.run("document.body.innerHTML = '<img src=x>'")
-
-
-def test_the_height_follows_the_content(robot: Robot, host: ChatHost, chromium: Browser) -> None:
-    robot.ask(host, "recap", SPAN)
-    drawn(chromium)
-    height = chromium.run(
-        "return Math.ceil(document.documentElement.getBoundingClientRect().height)"
-    )
-    chromium.leave_frames()
-    chromium.awaits("return proxy.clientHeight === arguments[0]", height)
 
 
 def test_recorded_text_stays_text(scratch: Path, host: ChatHost, chromium: Browser) -> None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from mcp import Client
@@ -155,8 +156,4 @@ def _invited(demo: subprocess.Popen[str]) -> str:
 
 def _listens(url: str) -> bool:
     with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", _port_of(url))) == 0
-
-
-def _port_of(url: str) -> int:
-    return int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
+        return probe.connect_ex(("127.0.0.1", urlsplit(url).port)) == 0

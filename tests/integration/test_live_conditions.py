@@ -9,14 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Final
+from typing import Any, Final
 
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from tests.support.live_recorder import (
     NS_PER_S,
-    LiveRecorder,
     Machine,
     answering,
     bag_files,
@@ -135,15 +134,24 @@ def fill_up(site: Machine, robot: Robot, folder: Path, least: str) -> None:
             recorder.wait_for("split_closed")
             full_at = time.time_ns()
             ballast = fill(disk)
-            status = wait_for_error(recorder)
-            assert moment_of(status) - full_at <= TOLD_WITHIN_S * NS_PER_S
+
+            def errors() -> list[dict[str, Any]]:
+                return [event for event in recorder.all_events() if event["level"] == "error"]
+
+            wait_for(errors, "an error event", alive=recorder.process)
+            assert moment_of(errors()[0]) - full_at <= TOLD_WITHIN_S * NS_PER_S
             if guarded:
                 recorder.wait_for("recording_paused")
             ballast.unlink()
             room_at = time.time_ns()
             if guarded:
                 recorder.wait_for("recording_resumed")
-            wait_for_ticks_after(recorder, robot, room_at)
+
+            def are_there() -> bool:
+                found = ticks(bag_files(recorder.bag_dir), robot.t0, HZ)
+                return any(tick.publish_time > room_at for tick in found)
+
+            wait_for(are_there, "messages after there was room", alive=recorder.process)
             recorder.wait_for_state(RecorderState.RECORDING)
             recorder.stop()
         finally:
@@ -202,7 +210,8 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
         # Each is found out when it is: topics one after the other, and silence by closed splits.
         for topic in HEARD:
             recorder.wait_for("subscribed", topic=topic)
-        wait_for_warnings(recorder, "/bumper", "/px4/position")
+        for event, topic in (("qos_refused", "/bumper"), ("unknown_type", "/px4/position")):
+            assert recorder.wait_for(event)[0]["reason"].startswith(f"{topic}:")
         recorder.wait_for("split_closed")
 
         status = recorder.wait_for_beat(
@@ -214,27 +223,3 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
     assert set(status.subscribed) == HEARD
     assert health["silent_topics"] == ["/bumper", "/clock"]
     assert health["last_error"]
-
-
-def wait_for_warnings(recorder: LiveRecorder, *topics: str) -> None:
-    def are_told() -> bool:
-        reasons = [e["reason"] for e in recorder.all_events() if "reason" in e]
-        return set(topics) <= {reason.partition(":")[0] for reason in reasons}
-
-    wait_for(are_told, f"warnings of {', '.join(topics)}", alive=recorder.process)
-
-
-def wait_for_error(recorder: LiveRecorder) -> dict[str, object]:
-    def errors() -> list[dict[str, object]]:
-        return [event for event in recorder.all_events() if event["level"] == "error"]
-
-    wait_for(errors, "an error event", alive=recorder.process)
-    return errors()[0]
-
-
-def wait_for_ticks_after(recorder: LiveRecorder, robot: Robot, moment: int) -> None:
-    def are_there() -> bool:
-        found = ticks(bag_files(recorder.bag_dir), robot.t0, HZ)
-        return any(tick.publish_time > moment for tick in found)
-
-    wait_for(are_there, "messages after there was room", alive=recorder.process)

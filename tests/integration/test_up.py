@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -83,32 +83,24 @@ def started(folder: Path, env: Mapping[str, str], *words: str) -> Iterator[Up]:
         sys.stdout.write(out.read_text() + err.read_text())
 
 
-def running() -> dict[str, tuple[str, list[str]]]:
-    """The parent and the command line of each process, by its id and its start."""
-    found: dict[str, tuple[str, list[str]]] = {}
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            words = (entry / "cmdline").read_bytes().decode().split("\0")
-        except OSError:  # it has ended
-            continue
-        if fields[0] != "Z":
-            found[f"{entry.name} {fields[19]}"] = fields[1], words
+def words_of(pid: int) -> list[str]:
+    """The command line of a process; nothing once it has ended."""
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+    return [""]
+
+
+def descendants(pid: int) -> dict[int, list[str]]:
+    """The command lines of all processes below a process, by their ids."""
+    found: dict[int, list[str]] = {}
+    for listed in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, listed.read_text().split()):
+            found |= {child: words_of(child), **descendants(child)}
     return found
 
 
-def descendants(pid: int) -> dict[str, list[str]]:
-    """The command lines of all processes below a process, by the same."""
-    found: dict[str, list[str]] = {}
-    above, all_running = {str(pid)}, running()
-    while new := {
-        key: words
-        for key, (parent, words) in all_running.items()
-        if parent in above and key not in found
-    }:
-        found |= new
-        above = {key.split()[0] for key in new}
-    return found
+def assert_have_ended(below: dict[int, list[str]]) -> None:
+    assert not [words for pid, words in below.items() if words_of(pid) == words != [""]]
 
 
 def test_it_records_what_it_proposes_answers_over_sse_and_leaves_no_process(
@@ -145,7 +137,7 @@ def test_it_records_what_it_proposes_answers_over_sse_and_leaves_no_process(
         assert {"ros2_memory.recorder", "ros2_memory.server", "record"} <= modules
         up.process.send_signal(signal.SIGINT)
         assert up.code() == 0
-        assert below.keys().isdisjoint(running())
+        assert_have_ended(below)
     assert "recorder and server have ended" in up.out.read_text()
     assert up.err.read_text() == ""
 
@@ -168,9 +160,9 @@ def test_a_list_that_is_there_is_used_and_a_program_that_dies_ends_it_with_code_
         up.served()
         below = descendants(up.process.pid)
         server = next(each for each, words in below.items() if "ros2_memory.server" in words)
-        os.kill(int(server.split()[0]), signal.SIGKILL)
+        os.kill(server, signal.SIGKILL)
         assert up.code() == 1
-        assert below.keys().isdisjoint(running())
+        assert_have_ended(below)
     assert (
         "ros2-memory up: the server ended with status -9: it gave no reason\n" in up.err.read_text()
     )

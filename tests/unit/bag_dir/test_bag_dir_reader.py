@@ -1,17 +1,35 @@
-"""The reader of a bag directory: what counts elsewhere is left out, the rest is as in the files."""
+"""The reader of a bag directory: what counts elsewhere is left out, the rest is as in the files.
 
+What counts is in `handover.json`; a bag that moments keep counts once.
+"""
+
+import json
+import os
 import random
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.handover_file import (
+    Counting,
+    CutClock,
+    Handover,
+    Overlap,
+    read_handover,
+    write_handover,
+)
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
+from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.history.context import Call, Memory, SnapshotSource
+from ros2_memory.queries import list_recorded_topics
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of
 
@@ -109,3 +127,142 @@ def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> Non
         (each.topic, each.type): (each.count, each.first, each.last)
         for each in reader.summarize(bag).topics
     } == {key: (len(times), times[0], times[-1]) for key, times in found.items()}
+
+
+def found(index: SnapshotSource) -> list[str]:
+    return [bag.file for bag in index.refresh().bags]
+
+
+# The index looks every few seconds; a bag may have gone from where it was since.
+
+
+def test_a_kept_bag_is_read_under_its_other_name(tmp_path: Path) -> None:
+    recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+    linked = tmp_path / "moments/one/rec/rec_0.mcap"
+    linked.parent.mkdir(parents=True)
+    os.link(recorded, linked)
+    reader = BagDirReader(McapReader(), tmp_path)
+    everything = TimeWindow.everything()
+
+    def read(path: Path) -> tuple[object, ...]:
+        return (
+            [each.log_time for each in reader.records(path, ["/odom"], everything)],
+            reader.newest(path, "/odom", everything) is not None,
+            [channel.topic for channel in reader.channels(path)],
+        )
+
+    before = read(recorded)
+    assert before == ([S], True, ["/odom"])
+    begun = reader.records(recorded, ["/odom"], everything)
+    recorded.unlink()
+    assert [each.log_time for each in begun] == [S]
+    assert read(recorded) == before
+    # The index is told how it is.
+    with pytest.raises(BagVanishedError):
+        reader.summarize(recorded)
+    os.link(linked, recorded)
+    linked.unlink()
+    assert read(linked) == before
+    recorded.unlink()
+    with pytest.raises(BagVanishedError):
+        read(recorded)
+
+
+def test_a_hard_link_beside_its_original_is_no_second_bag(tmp_path: Path) -> None:
+    recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+    memory = memory_of(tmp_path)
+    assert found(memory.index) == [str(recorded)]
+    linked = tmp_path / "rec/rec_0_link.mcap"
+    os.link(recorded, linked)
+    saved = tmp_path / "moments/one/rec/rec_0.mcap"
+    saved.parent.mkdir(parents=True)
+    os.link(recorded, saved)
+    for index in (memory.index, memory_of(tmp_path).index):
+        assert found(index) == [str(recorded)]
+    [row] = list_recorded_topics(memory, Call())
+    assert row.count == 1
+    # One with an earlier name takes over.
+    outer = tmp_path / "a.mcap"
+    os.link(recorded, outer)
+    assert found(memory.index) == [str(outer)]
+    outer.unlink()
+    recorded.unlink()
+    assert found(memory.index) == [str(linked)]
+    linked.unlink()
+    assert found(memory.index) == [str(saved)]
+    saved.unlink()
+    assert found(memory.index) == []
+
+
+MOMENTS = st.integers(MIN_NS, MAX_NS)
+OVERLAPS = st.builds(
+    Overlap,
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    st.lists(st.text(min_size=1, max_size=5), max_size=3).map(tuple),
+)
+NAMES = st.none() | st.from_regex(r"rec_[0-9]{1,3}", fullmatch=True)
+HANDOVERS = st.builds(
+    Handover,
+    state=st.sampled_from(Counting),
+    clock=st.sampled_from(CutClock),
+    previous=NAMES,
+    counts_from=st.none() | MOMENTS,
+    begin=st.none() | OVERLAPS,
+    next=NAMES,
+    counts_until=st.none() | MOMENTS,
+    end=st.none() | OVERLAPS,
+    notes=st.lists(st.text(max_size=9), max_size=2).map(tuple),
+)
+
+FULL = Handover(
+    previous="rec_1",
+    counts_from=1_000,
+    begin=Overlap(900, 1_100, ("rec_2_0.mcap",)),
+    next="rec_3",
+    counts_until=9_000,
+    end=Overlap(8_900, 9_500, ("rec_2_7.mcap", "rec_2_8.mcap")),
+    notes=("a note",),
+)
+
+
+@given(handover=HANDOVERS)
+def test_what_is_written_is_read(
+    tmp_path_factory: pytest.TempPathFactory, handover: Handover
+) -> None:
+    folder = tmp_path_factory.mktemp("recording")
+    write_handover(folder, handover)
+    assert read_handover(folder) == (handover, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"format": 2}, "format is 2"),
+        ({"state": "maybe"}, "state: Input should be 'counts', 'pending' or 'void'"),
+        ({"previous": "../elsewhere"}, "previous: Value error, it must be the name of"),
+        *(({"next": name}, "name of a recording") for name in ("..", ".", "/etc", "")),
+        ({"counts_from_ns": True}, "counts_from_ns: Input should be a valid integer"),
+        ({"counts_until_ns": 2**63}, "counts_until_ns: Input should be less than"),
+        ({"begin": []}, "begin: Input should be a dictionary"),
+        ({"end": {"files": "x"}}, "end.log_from_ns: Field required"),
+    ],
+)
+def test_what_it_cannot_mean_is_told_and_then_everything_counts(
+    tmp_path: Path, change: dict[str, object], reason: str
+) -> None:
+    write_handover(tmp_path, FULL)
+    path = tmp_path / HANDOVER_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    handover, problem = read_handover(tmp_path)
+    assert handover == Handover()
+    assert problem is not None
+    assert reason in problem
+
+
+@pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"\xff", b"[" * 100_000, b" " * (2 << 20)])
+def test_any_bytes_are_read_without_failing(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / HANDOVER_FILE).write_bytes(text)
+    handover, problem = read_handover(tmp_path)
+    assert handover == Handover()
+    assert problem is not None

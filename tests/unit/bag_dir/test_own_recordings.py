@@ -258,9 +258,7 @@ def test_after_a_kill_the_next_start_counts_what_was_not_noted(tmp_path: Path) -
     assert not claimed(tmp_path).owns_bag(later)
 
 
-def test_of_an_earlier_version_a_recording_holds_all_that_are_named_after_it(
-    tmp_path: Path,
-) -> None:
+def test_a_recording_of_an_earlier_version_holds_all_named_after_it(tmp_path: Path) -> None:
     path, other = (embedding(tmp_path / A / name) for name in (f"{A}_12.mcap", "x_0.mcap"))
     own = claimed(tmp_path)
     identity = identity_of(tmp_path / A)

@@ -2,9 +2,10 @@
 
 import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from structlog.testing import capture_logs
@@ -31,10 +32,13 @@ class Yard:
             bag_dir, self.reader, self.clock, refresh_s=5.0, split_duration_s=10.0
         )
 
-    def age(self, at: int = LONG_AGO) -> None:
+    def split(self, number: int, times: Sequence[int] = (), **how: Any) -> Path:
+        return plain(self.bag_dir / "rec" / f"rec_{number}.mcap", times, **how)
+
+    def age(self) -> None:
         """Gives every file and directory the same mtime."""
         for path in (self.bag_dir, *self.bag_dir.rglob("*")):
-            os.utime(path, ns=(at, at), follow_symlinks=False)
+            os.utime(path, ns=(LONG_AGO, LONG_AGO), follow_symlinks=False)
 
     def scan_after(self, seconds: float = 0.0) -> Snapshot:
         self.clock.at += round(seconds * S)
@@ -52,11 +56,11 @@ def _names(files: Iterable[BagFile | SetAside]) -> list[str]:
 
 
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
-    for split in range(3):
-        plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
+    for number in range(3):
+        yard.split(number, [number])
     yard.age()
     yard.scan_after()
-    new = plain(yard.bag_dir / "rec" / "rec_3.mcap", [3])
+    new = yard.split(3, [3])
     os.utime(new, ns=(LONG_AGO, LONG_AGO))
     for _ in range(3):
         assert len(yard.scan_after(10).bags) == 4
@@ -107,16 +111,16 @@ def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None
 
 
 def test_a_question_that_reaches_past_the_newest_end_looks_for_newer_bags(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    yard.split(0, [0, 9])
     first = yard.index.snapshot(reach=9)
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [10, 19])
+    yard.split(1, [10, 19])
     assert yard.index.snapshot() is first
     assert yard.index.snapshot(reach=9) is first
     assert _names(yard.index.snapshot(reach=10).bags) == ["rec_0.mcap", "rec_1.mcap"]
 
 
 def test_callers_that_come_during_a_scan_share_its_result(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    yard.split(0, [0, 9])
     yard.age()
     reading, go_on = threading.Event(), threading.Event()
 
@@ -136,8 +140,8 @@ def test_callers_that_come_during_a_scan_share_its_result(yard: Yard) -> None:
 
 
 def test_a_scan_that_fails_on_a_defect_loses_nothing(yard: Yard) -> None:
-    for split in range(3):
-        plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
+    for number in range(3):
+        yard.split(number, [number])
     yard.age()
 
     def fail(path: Path) -> None:
@@ -151,7 +155,7 @@ def test_a_scan_that_fails_on_a_defect_loses_nothing(yard: Yard) -> None:
 
 
 def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    yard.split(0, [0, 9])
     (yard.bag_dir / "rec" / "rec_1.mcap").touch()
     yard.age()
     with capture_logs() as events:
@@ -165,15 +169,15 @@ def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
 
 
 def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9], silent=["/scan", "/lost"])
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [10, 19], topic="/scan")
-    plain(yard.bag_dir / "rec" / "rec_2.mcap", silent=["/idle"])
-    plain(yard.bag_dir / "rec" / "rec_3.mcap", [30], closed=False)
+    yard.split(0, [0, 9], silent=["/scan", "/lost"])
+    yard.split(1, [10, 19], topic="/scan")
+    yard.split(2, silent=["/idle"])
+    yard.split(3, [30], closed=False)
     (yard.bag_dir / "rec" / "rec_4.mcap").touch()
     plain(yard.bag_dir / "old" / "old_0.db3", [1])
     (yard.bag_dir / "latest").symlink_to(yard.bag_dir / "rec", target_is_directory=True)
     yard.age()
-    plain(yard.bag_dir / "rec" / "rec_5.mcap", [40], closed=False)
+    yard.split(5, [40], closed=False)
     os.utime(yard.bag_dir / "rec" / "rec_5.mcap", ns=(NOW, NOW))
     snapshot = yard.index.refresh()
     assert [(bag.path.name, bag.state) for bag in snapshot.bags] == [

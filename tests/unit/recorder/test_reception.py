@@ -242,7 +242,6 @@ def offer(reliability: str, durability: str) -> str:
         ([("reliable", "transient_local"), ("best_effort", "transient_local")], False, True),
         ([("reliable", "transient_local"), ("reliable", "volatile")], True, False),
         ([("1", "1")], True, True),
-        ([("2", "2")], False, False),
         ([("unknown", "unknown")], False, False),
     ],
 )

@@ -25,9 +25,12 @@ def left(root: Path) -> list[str]:
     return sorted(str(path.relative_to(root)) for path in root.rglob("*"))
 
 
-def test_bags_of_every_kind_go_with_what_lies_beside_them(tmp_path: Path) -> None:
+def test_bags_of_every_kind_go_with_what_lies_beside_them_in_a_directory_or_a_link_to_it(
+    tmp_path: Path,
+) -> None:
+    (link := tmp_path / "link").symlink_to(tmp_path / "bags")
     make(
-        tmp_path,
+        tmp_path / "bags",
         "rec_1/rec_1_0.mcap",
         "rec_1/rec_1_1.mcap.zstd",
         "rec_1/metadata.yaml",
@@ -40,8 +43,8 @@ def test_bags_of_every_kind_go_with_what_lies_beside_them(tmp_path: Path) -> Non
         "recorder.json",
         "recorder.qos.yaml",
     )
-    wiped = clear_bags(tmp_path)
-    assert left(tmp_path) == ["deep"]
+    wiped = clear_bags(link)
+    assert left(tmp_path / "bags") == ["deep"]
     assert (wiped.files, wiped.bytes, wiped.faults) == (5, 25, [])
 
 
@@ -68,21 +71,9 @@ def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -
     make(tmp_path, "rec_1/rec_1_0.mcap", "rec_1/notes.txt", "map.pgm", "metadata.yaml")
     make(tmp_path, "not_a_bag/metadata.yaml", "not_a_bag/handover.json", "x/recorder.json")
     make(tmp_path, ".cache/a.mcap", "recorder.lock")
+    before = left(tmp_path)
     clear_bags(tmp_path)
-    assert left(tmp_path) == [
-        ".cache",
-        ".cache/a.mcap",
-        "map.pgm",
-        "metadata.yaml",
-        "not_a_bag",
-        "not_a_bag/handover.json",
-        "not_a_bag/metadata.yaml",
-        "rec_1",
-        "rec_1/notes.txt",
-        "recorder.lock",
-        "x",
-        "x/recorder.json",
-    ]
+    assert [*set(before) - set(left(tmp_path))] == ["rec_1/rec_1_0.mcap"]
 
 
 def test_of_the_next_simulation_nothing_is_excluded_by_the_times_of_the_last(
@@ -106,13 +97,6 @@ def test_what_is_known_by_log_times_stays_where_a_recording_is_left(
     clear_bags(tmp_path)
     is_left = [(tmp_path / name).exists() for name in sorted(TIMED_FILES)]
     assert is_left == [folder != "rec_1"] * len(TIMED_FILES)
-
-
-def test_a_bag_directory_that_is_a_link_itself_is_cleared(tmp_path: Path) -> None:
-    make(tmp_path, "real/a.mcap")
-    (tmp_path / "bags").symlink_to(tmp_path / "real")
-    clear_bags(tmp_path / "bags")
-    assert left(tmp_path / "real") == []
 
 
 def test_the_root_homes_what_holds_them_and_a_link_to_one_are_refused(tmp_path: Path) -> None:

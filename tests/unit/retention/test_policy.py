@@ -289,15 +289,6 @@ def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
 # `kept` are files of moments, which other names of may be deleted.
 
 
-def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept() -> None:
-    bags = hourly(3)
-    limits = replace(LIMITS, min_free_bytes=10)
-    found = plan_deletions(
-        replace(contents(*bags, free_bytes=0), saved=sizes(bags[-1].files)), limits
-    )
-    assert (names(found.to_delete), found.fits) == (["h1"], True)
-
-
 @given(
     st.lists(
         st.tuples(st.integers(0, 200), st.integers(0, 6)),

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -286,21 +287,25 @@ def interrupted_at(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Kills the process at the nth of the points at which the disk shows a difference."""
     left = itertools.count(count, -1)
 
-    def dying(real: Callable[..., object], *, after: bool) -> Callable[..., object]:
+    def point() -> None:
+        if not next(left):
+            raise _Killed
+
+    def dying(owner: object, name: str, *, before: bool = True) -> None:
+        real = getattr(owner, name)
+
         def call(*args: object, **given: object) -> object:
-            if not after and not next(left):
-                raise _Killed
+            if before:
+                point()
             found = real(*args, **given)
-            if after and not next(left):
-                raise _Killed
+            point()
             return found
 
-        return call
+        monkeypatch.setattr(owner, name, call)
 
-    for module, name in ((SCREENED, "write"), (repair, "replace_file")):
-        real = getattr(module, name)
-        monkeypatch.setattr(module, name, dying(dying(real, after=True), after=False))
-    monkeypatch.setattr(McapWriter, "cut", dying(McapWriter.cut, after=True))
+    dying(SCREENED, "write")
+    dying(repair, "replace_file")
+    dying(McapWriter, "cut", before=False)
 
 
 def record_a_day(bags: ScreenedBags, step: Callable[[], None]) -> None:
@@ -334,27 +339,24 @@ def test_a_kill_at_any_point_serves_nothing_unscreened(
 ) -> None:
     killed = 0
 
+    def started_again(act: Callable[..., Any]) -> Callable[..., Any]:
+        def acting(*given: float) -> Any:
+            nonlocal killed
+            try:
+                return act(*given)
+            except _Killed:
+                killed += 1
+                bags.screening = bags.new()
+                return act(*given)
+
+        return acting
+
     def step() -> None:
-        nonlocal killed
-        try:
-            bags.step()
-        except _Killed:
-            killed += 1
-            bags.screening = bags.new()
+        bags.step()
         assert {*bags.seconds()} <= {*EXPECTED}
 
-    begin = bags.begin
-
-    def beginning(second: float) -> str:
-        nonlocal killed
-        try:
-            return begin(second)
-        except _Killed:
-            killed += 1
-            bags.screening = bags.new()
-            return begin(second)
-
-    monkeypatch.setattr(bags, "begin", beginning)
+    for name in ("begin", "step"):
+        monkeypatch.setattr(bags, name, started_again(getattr(bags, name)))
     with monkeypatch.context() as patched:
         interrupted_at(moment, patched)
         record_a_day(bags, step)
