@@ -10,18 +10,18 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import httpx2
 import pytest
 
 from tests.support.processes import PATIENCE_S, until
 
-CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
-CHROMEDRIVER: Final = shutil.which("chromedriver")
-TAB: Final = "\ue004"
-ENTER: Final = "\ue007"
-RIGHT: Final = "\ue014"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+CHROMEDRIVER = shutil.which("chromedriver")
+TAB = "\ue004"
+ENTER = "\ue007"
+RIGHT = "\ue014"
 
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None or CHROMEDRIVER is None,

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import anyio
 import pytest
@@ -20,15 +20,15 @@ from tests.support.demo_bags import ASKED_AT_S, recorded
 from tests.support.processes import http_server
 from tests.support.robot_run import T0_S
 
-POLICY: Final = (
+POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data:; media-src 'self' data:; connect-src 'none'; frame-src 'none'; "
     "object-src 'none'; base-uri 'self'"
 )
 """The restrictive default, and what the sandbox has to enforce besides."""
-LAX: Final = "default-src * 'unsafe-inline'"
+LAX = "default-src * 'unsafe-inline'"
 """That of a host that enforces nothing."""
-HOST: Final = """<!DOCTYPE html><title>host</title>
+HOST = """<!DOCTYPE html><title>host</title>
 <meta name="viewport" content="width=device-width">
 <link rel="icon" href="data:,">
 <style>iframe { border: 0; width: 100%; }</style><body></body>
@@ -57,7 +57,7 @@ function begin(given) {
   document.body.append(proxy);
 }
 </script>"""
-PROXY: Final = """<!DOCTYPE html><title>proxy</title>
+PROXY = """<!DOCTYPE html><title>proxy</title>
 <meta name="viewport" content="width=device-width">
 <style>body { margin: 0; } iframe { border: 0; width: 100%; height: 100vh; display: block; }</style>
 <script>

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
@@ -31,7 +31,7 @@ from tests.support.ros_processes import (
 )
 from tests.timing import in_time
 
-NOBODY: Final = "65534"
+NOBODY = "65534"
 needs_another_user = pytest.mark.skipif(
     os.geteuid() != 0 or not all(map(shutil.which, ("setpriv", "nsenter", "unshare", "ip"))),
     reason="root alone may run the recorder as another user (with util-linux and iproute2)",
@@ -66,10 +66,10 @@ def as_nobody() -> list[str]:
     return [*become, "--securebits=+no_setuid_fixup", "env", *(f"--unset={n}" for n in ours)]
 
 
-HZ: Final = 20.0
-DISK_BYTES: Final = 8_000_000
-TOLD_WITHIN_S: Final = 10.0
-HEARD: Final = {"/odom", "/bumper", "/clock"}
+HZ = 20.0
+DISK_BYTES = 8_000_000
+TOLD_WITHIN_S = 10.0
+HEARD = {"/odom", "/bumper", "/clock"}
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -48,8 +48,8 @@ from tests.support.ros_processes import end, publishing_robot
 from tests.support.served import Served
 from tests.timing import Watch, driven
 
-KINDS: Final = ("child", "daemon", "both")
-RECORD_OVERHEAD_BYTES: Final = 31  # of one MCAP message besides its payload
+KINDS = ("child", "daemon", "both")
+RECORD_OVERHEAD_BYTES = 31  # of one MCAP message besides its payload
 
 
 class Terms(NamedTuple):
@@ -258,11 +258,11 @@ def alone(among: Sequence[Tick]) -> list[Tick]:
     return [tick for tick in among if tick not in near]
 
 
-KILLS: Final = 50 if LONG else 6
-SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
-CHUNK_BYTES: Final = 16384  # recorder.chunk_bytes
-PROMISED_S: Final = 2.0
-TERMS: Final = (
+KILLS = 50 if LONG else 6
+SEED = int(os.environ.get("EPISODIC_SEED", "20261120"))
+CHUNK_BYTES = 16384  # recorder.chunk_bytes
+PROMISED_S = 2.0
+TERMS = (
     Terms("reference", 50.0, 2, 6, 7.0 if LONG else 2.5, SEED),
     Terms("slow", 1.0, 2, 9, 3.5, SEED + 1),
 )
@@ -346,7 +346,7 @@ def at_1_hz_at_most_an_open_split_is_lost_and_not_more_than_a_chunk(
     assert most * slow.bytes_of_a_tick <= CHUNK_BYTES
 
 
-CHECKS: Final = (
+CHECKS = (
     nothing_is_lost_but_at_the_kills,
     at_the_reference_rates_at_most_2_s_are_lost,
     at_1_hz_at_most_an_open_split_is_lost_and_not_more_than_a_chunk,
@@ -359,10 +359,10 @@ def test_by_the_clock(campaigns: Campaigns, check: Callable[[dict[str, Campaign]
         check(campaigns.found)
 
 
-ROTATIONS: Final = 100 if LONG else 3
-HZ: Final = 50.0
-LONGEST_STALL_S: Final = 1.0
-LONGEST_PAUSE_S: Final = 1.5
+ROTATIONS = 100 if LONG else 3
+HZ = 50.0
+LONGEST_STALL_S = 1.0
+LONGEST_PAUSE_S = 1.5
 
 
 class Rotated(NamedTuple):

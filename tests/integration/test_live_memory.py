@@ -1,30 +1,37 @@
 """The whole system over real DDS: a robot drives, is recorded, and is asked about while it drives.
 
 Three recorders record the same drive, each with a server of its own: one rotates, one has its
-recorder process killed and is restarted later, and one, with splits of 10 s, is killed whole.
+recorder process killed and is restarted later, and one, with splits of 10 s, is killed whole. Of
+what rotates a second server answers from what is being written.
 """
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain, groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
+from ros2_memory.core.timebase import unix_rounded_up
 from tests.support.closed_form import position
 from tests.support.live_recorder import (
     NS_PER_S,
     Answer,
     LiveRecorder,
     Machine,
+    Tick,
     answering,
     answers,
     await_answerable,
     await_moment,
+    bag_files,
     machine,
+    ticks,
 )
 from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import (
@@ -34,11 +41,15 @@ from tests.support.ros_processes import (
 from tests.support.served import Served
 from tests.timing import Watch, driven
 
-HZ: Final = 50.0
-AGO_S: Final = 10
-NAMES: Final = ("rotating", "killed", "ten")
-TEN_S_AGO: Final = ("get_position_seconds_ago", {"seconds_ago": AGO_S})
-TRAVELLED: Final = 0.05  # m: how far from the closed form an answer may be
+HZ = 50.0
+AGO_S = 10
+FRESH_S = 3
+NAMES = ("rotating", "killed", "ten")
+NEWEST = ("get_position_seconds_ago", {"seconds_ago": 0, "tolerance_s": 60})
+A_MOMENT_AGO = ("get_position_seconds_ago", {"seconds_ago": FRESH_S, "tolerance_s": 1})
+TEN_S_AGO = ("get_position_seconds_ago", {"seconds_ago": AGO_S})
+TRAVELLED = 0.05  # m: how far from the closed form an answer may be
+ROUNDED_S = 0.002  # ages are whole milliseconds
 
 
 @dataclass
@@ -57,6 +68,12 @@ class Drive:
     topics: list[dict[str, Any]] = field(default_factory=list)
     after: dict[str, Any] = field(default_factory=dict)
     """`data_time_range` of each memory at the end."""
+    newest: list[Answer] = field(default_factory=list)
+    """Replies about now, from what was being written, and about 3 s ago."""
+    ago: list[Answer] = field(default_factory=list)
+    copies: list[list[Tick]] = field(default_factory=list)
+    """What stands in each recording that was being written then, and when what counts came."""
+    recorded: list[int] = field(default_factory=list)
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +102,10 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder) -> Drive:
             name: stack.enter_context(answering(site.bag_dir(name), folder / f"{name}.log"))
             for name in NAMES
         }
+        live = answering(
+            site.bag_dir("rotating"), folder / "live.log", "reader.include_active=true"
+        )
+        served["live"] = stack.enter_context(live)
         short = "recording.split_duration_s=2"
         drive = Drive(
             watch,
@@ -113,6 +134,10 @@ def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot)
     drive.ten.kill(with_children=False)
     drive.ten = site.record("ten", "recording.split_duration_s=10")
 
+    while time.time_ns() < drive.t0 + 22 * NS_PER_S:
+        newest, ago = answers(served["live"], NEWEST, A_MOMENT_AGO)
+        drive.newest.append(newest)
+        drive.ago.append(ago)
     drive.rotating.wait_for("rotated", 3)
     await_answerable(served["killed"], child_is_back)
     await_moment(child_is_back + 12 * NS_PER_S)
@@ -138,6 +163,11 @@ def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot)
 
 def _look_back(drive: Drive, served: dict[str, Served]) -> None:
     """Asks about the whole drive after its end."""
+    files = bag_files(drive.rotating.bag_dir)
+    drive.recorded = [tick.log_time for tick in ticks(files, drive.t0, HZ)]
+    recordings = groupby(files, key=lambda file: file.parent)
+    found = [ticks([*own], drive.t0, HZ, counting=False) for _, own in recordings]
+    drive.copies = [*filter(None, found)]
     wanted = {"condition_type": "contains", "value": "scissors", "fields": "header.stamp"}
     found = ("find_last_match", {"topic": "/vision/*/scene_objects", **wanted})
     for name in ("rotating", "killed"):
@@ -156,6 +186,44 @@ def is_right(what: str, drive: Drive) -> None:
     assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
 
 
+def is_fresh(drive: Drive) -> None:
+    """What was recorded 3 s before a question is found by it."""
+    assert len(drive.newest) >= 5
+    assert any(told.get("from_active") is True for told, *_ in drive.newest)
+    for told, asked, _ in drive.newest:
+        assert "timestamp" in told, told
+        recorded = max(at for at in drive.recorded if at <= (asked - FRESH_S) * NS_PER_S)
+        assert told["timestamp"] >= unix_rounded_up(recorded)
+
+
+def is_right_while_it_is_written(drive: Drive) -> None:
+    for told, asked, answered in drive.ago:
+        assert "x" in told, told
+        now = told["timestamp"] + told["age_s"]
+        assert asked - ROUNDED_S <= now <= answered + ROUNDED_S
+        x, y = position(told["timestamp"] - drive.t0 / NS_PER_S)
+        assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
+        # In a rotation two recordings log one message at times of their own: either may answer.
+        found = [
+            each.number
+            for each in chain.from_iterable(drive.copies)
+            if abs(told["timestamp"] - each.log_time / NS_PER_S) <= 2e-6  # whole microseconds
+        ]
+        assert found, told
+        # What one of them lost or wrote late need not be known while both still run.
+        since, until = now - FRESH_S - ROUNDED_S, now - FRESH_S + ROUNDED_S
+        running = [each for each in drive.copies if each[-1].log_time >= since * NS_PER_S]
+        oldest = min(_newest_of_each(running, since))
+        newest = max(_newest_of_each(drive.copies, until))
+        assert oldest <= found[0] <= newest, (told, asked, answered, drive.t0)
+
+
+def _newest_of_each(recordings: list[list[Tick]], at: float) -> list[int]:
+    """The newest message that each recording had received at a moment, if it had any."""
+    received = [[t.number for t in each if t.log_time <= at * NS_PER_S] for each in recordings]
+    return [max(numbers) for numbers in received if numbers]
+
+
 def counts_once(drive: Drive) -> None:
     assert len(drive.rotating.events("rotated")) >= 3
     assert {row["topic"]: row["count"] for row in drive.topics} == drive.published
@@ -167,7 +235,7 @@ def all_answers(name: str, drive: Drive) -> None:
     assert {kind: drive.after[name][kind] for kind in aside} == {key: [] for key in aside}
 
 
-AFTER: Final = (
+AFTER = (
     "12 s, in splits of 10 s",
     "12 s, in splits of 2 s",
     "rotations",
@@ -175,8 +243,10 @@ AFTER: Final = (
     "a restart",
     "a killed daemon",
 )
-CHECKS: Final[Mapping[str, Callable[[Drive], None]]] = {
+CHECKS: Mapping[str, Callable[[Drive], None]] = {
     **{f"where it was 10 s ago is right after {what}": partial(is_right, what) for what in AFTER},
+    "what was recorded 3 s before is found while it is being written": is_fresh,
+    "where it was 3 s ago is right while it is being written": is_right_while_it_is_written,
     "over three rotations every message that was sent counts once": counts_once,
     **{
         f"no file of {name} is left without an answer": partial(all_answers, name) for name in NAMES

@@ -9,7 +9,6 @@ import subprocess
 from collections.abc import Mapping
 from contextlib import closing, redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Final
 from unittest.mock import patch
 
 import anyio
@@ -26,7 +25,7 @@ from tests.support.processes import until
 from tests.support.robot_run import T0, ask_everything, write_run
 from tests.support.served import Served, serving
 
-COMMANDS: Final = {
+COMMANDS = {
     "info": ["info"],
     "topics": ["topics"],
     "ask": ["ask", "list_recorded_topics"],
@@ -39,7 +38,7 @@ COMMANDS: Final = {
     "forget": ["forget", "--last", "1", "--dry-run"],
     "config": ["config", "show"],
 }
-STORAGES: Final = ("mcap", "rosbag2")
+STORAGES = ("mcap", "rosbag2")
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from tests.support.processes import until
 from tests.support.robot_run import write_run
 from tests.support.served import serving
 
-PAGE = (ROOT / "docs/how-to/tls.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/how-to/tls.md").read_text()
 NAME = "robot.example"
 GOOD = "kJ7-x._~+/0123456789=="
 SHOWN = {"Authorization": f"Bearer {GOOD}"}
@@ -128,7 +128,7 @@ def proxying(program: str, behind: int, folder: Path) -> Iterator[Front]:
         "nginx": (AROUND_NGINX, ["-e", "stderr", "-p", f"{folder}", "-c", f"{config}"]),
         "caddy": (AROUND_CADDY, ["run", "--config", f"{config}", "--adapter", "caddyfile"]),
     }[program]
-    config.write_text(around.format(folder=folder, told=text), encoding="utf-8")
+    config.write_text(around.format(folder=folder, told=text))
     env = {"PATH": "/usr/bin", "HOME": str(folder), "XDG_DATA_HOME": str(folder)}
     found = shutil.which(program)
     assert found
@@ -138,7 +138,7 @@ def proxying(program: str, behind: int, folder: Path) -> Iterator[Front]:
         front = Front(port, certificate)
 
         def up() -> bool | None:
-            assert proxy.poll() is None, (folder / "log").read_text(encoding="utf-8")
+            assert proxy.poll() is None, (folder / "log").read_text()
             return front.is_up() or None
 
         try:

@@ -7,37 +7,28 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bootstrap import build_recorder
+from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Recorder
 from ros2_memory.recorder.null import NullRecorder
-from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.processes import until
 from tests.support.simulated_recorders import PlayedHousekeeper
 
 
-def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
+def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
     programs = folder / "bin"
     programs.mkdir(exist_ok=True)
     stub_ros2.install(programs / "ros2")
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     (folder / "topics.yaml").write_text("topics: [/odom]\n")
-    return Ros2BagRecorder(
-        McapReader(),
-        bag_dir=folder / "bags",
-        topics_file=folder / "topics.yaml",
-        split_duration_s=10,
-        session_duration_s=600,
-        use_sim_time=False,
-        queue_mb=64,
-        min_free_gb=0.0,
-        setup_files=(),
-        latched_topics=("/tf_static",),
-        repeat_latched=(),
-        chunk_bytes=16384,
-        required=(),
+    given = (f"bag_dir={folder}/bags", f"topics_file={folder}/topics.yaml")
+    return build_recorder(
+        load_settings((*(f"recording.{each}" for each in given), "retention.min_free_gb=0"), {}),
+        reader=McapReader(),
         housekeeper=PlayedHousekeeper(),
         own=OwnRecordings(folder / "bags"),
         keep_open=(),
@@ -59,7 +50,7 @@ def recorder(
 
 def drive(recorder: Recorder) -> bool:
     """Lets it work until it records; False for one that never does."""
-    if not isinstance(recorder, Ros2BagRecorder):
+    if isinstance(recorder, NullRecorder):
         return False
 
     def ticked() -> bool:

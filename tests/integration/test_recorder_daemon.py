@@ -200,14 +200,6 @@ def test_one_that_starts_while_the_child_of_a_killed_one_still_closes_waits_for_
         following.stop()
 
 
-def test_a_second_recorder_is_refused_and_told_who_records(site: Site) -> None:
-    daemon = site.run()
-    code, message = site.refusal()
-    assert code == 1
-    assert f"process {daemon.process.pid} on {socket.gethostname()}" in message
-    daemon.stop()
-
-
 def test_the_service_manager_is_told(site: Site) -> None:
     address = site.folder / "notify"
     with service_manager(address) as manager:
@@ -223,9 +215,19 @@ def test_the_service_manager_is_told(site: Site) -> None:
         assert "NOTIFY_SOCKET" not in Path(f"/proc/{os.getpid()}/environ").read_text()
 
 
-def test_what_newer_distributions_can_do_is_asked_for(site: Site) -> None:
+def test_the_child_has_the_robots_environment_and_does_what_newer_distributions_can(
+    site: Site,
+) -> None:
+    setup = site.folder / "setup.bash"
+    setup.write_text("export FROM_SETUP=yes\n")
+    site.env |= {"ROS_DOMAIN_ID": "42", "VIRTUAL_ENV": "/of/ours", "PYTHONHOME": sys.base_prefix}
     site.env["STUB_OPTIONS"] = "--stats_max_publishing_rate"
-    daemon = site.run()
+    daemon = site.run(f"recorder.setup_files=[{setup}]")
+    environ = Path(f"/proc/{daemon.child}/environ").read_bytes().split(b"\0")
+    assert {b"FROM_SETUP=yes", b"ROS_DOMAIN_ID=42"} <= set(environ)
+    names = {entry.partition(b"=")[0] for entry in environ}
+    assert {b"VIRTUAL_ENV", b"PYTHONHOME", b"BASH_ENV"}.isdisjoint(names)
+    assert f"ROS_LOG_DIR={site.bag_dir}/.ros_log".encode() in environ
     argv = Path(f"/proc/{daemon.child}/cmdline").read_bytes().split(b"\0")
     assert argv[argv.index(b"--stats_max_publishing_rate") + 1] == b"1"
     closed = daemon.wait_for("split_closed")[0]
@@ -242,20 +244,9 @@ def test_what_newer_distributions_can_do_is_asked_for(site: Site) -> None:
     daemon.stop()
 
 
-def test_the_environment_of_the_recorder_is_the_robots(site: Site) -> None:
-    setup = site.folder / "setup.bash"
-    setup.write_text("export FROM_SETUP=yes\n")
-    site.env |= {"ROS_DOMAIN_ID": "42", "VIRTUAL_ENV": "/of/ours", "PYTHONHOME": sys.base_prefix}
-    daemon = site.run(f"recorder.setup_files=[{setup}]")
-    environ = Path(f"/proc/{daemon.child}/environ").read_bytes().split(b"\0")
-    assert {b"FROM_SETUP=yes", b"ROS_DOMAIN_ID=42"} <= set(environ)
-    names = {entry.partition(b"=")[0] for entry in environ}
-    assert {b"VIRTUAL_ENV", b"PYTHONHOME", b"BASH_ENV"}.isdisjoint(names)
-    assert f"ROS_LOG_DIR={site.bag_dir}/.ros_log".encode() in environ
-    daemon.stop()
-
-
-def test_of_what_ros_logs_of_itself_only_the_newest_runs_are_kept(site: Site) -> None:
+def test_the_newest_logs_of_ros_are_kept_and_a_second_recorder_is_told_who_records(
+    site: Site,
+) -> None:
     logs = site.bag_dir / ".ros_log"
     logs.mkdir(parents=True)
     for number in range(50):
@@ -263,9 +254,13 @@ def test_of_what_ros_logs_of_itself_only_the_newest_runs_are_kept(site: Site) ->
         os.utime(logs / f"ros2_{number}.log", (number, number))
     (logs / "a_directory").mkdir()
     os.utime(logs / "a_directory", (0, 0))
-    site.run().stop()
+    daemon = site.run()
     left = {path.name for path in logs.iterdir()}
     assert left == {"a_directory", *(f"ros2_{n}.log" for n in range(30, 50))}
+    code, message = site.refusal()
+    assert code == 1
+    assert f"process {daemon.process.pid} on {socket.gethostname()}" in message
+    daemon.stop()
 
 
 def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:

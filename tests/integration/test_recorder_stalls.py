@@ -9,7 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, groupby, pairwise
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from mcap.reader import make_reader
@@ -28,23 +28,23 @@ from tests.support.live_recorder import (
 from tests.support.served import Served
 from tests.timing import in_time
 
-STALLS: Final = 3
-STALL_S: Final = 3.0
-LEAST_S: Final = 0.5
+STALLS = 3
+STALL_S = 3.0
+LEAST_S = 0.5
 """The shortest gap of topics that come with 6 Hz or more."""
-ABSENT_S: Final = 0.6
-LATE_S: Final = 0.1
-PERIOD_S: Final = 0.02
+ABSENT_S = 0.6
+LATE_S = 0.1
+PERIOD_S = 0.02
 """Of the second most frequent topic."""
-ROUNDED_S: Final = 2e-6
+ROUNDED_S = 2e-6
 """Replies give microseconds."""
-EDGE_S: Final = 2 * PERIOD_S + 0.06
-TOPICS: Final = ("/odom", "/scan", "/slow")
-ROBOTS: Final = {
+EDGE_S = 2 * PERIOD_S + 0.06
+TOPICS = ("/odom", "/scan", "/slow")
+ROBOTS = {
     "best effort": ("/odom:200:best_effort", "/scan:50:best_effort", "/slow:2:best_effort"),
     "reliable": ("/odom:50:reliable", "/scan:50:reliable", "/slow:2:reliable"),
 }
-BOTH: Final = ("/odom:50:reliable", "/scan:50:best_effort", "/slow:2:reliable")
+BOTH = ("/odom:50:reliable", "/scan:50:best_effort", "/slow:2:reliable")
 
 Span = tuple[float, float]
 """Unix seconds."""

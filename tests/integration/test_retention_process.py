@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 from mcap.writer import CompressionType
@@ -39,12 +39,12 @@ LAYOUT = McapLayout(
     compression=CompressionType.ZSTD,
     latched=frozenset({"/tf_static", DOCK}),
 )
-SPLITS: Final = 200 if LONG else 20
-SPLITS_IN_RECORDING: Final = 5
-KEPT_SPLITS: Final = 6
-SLACK: Final = 8192
+SPLITS = 200 if LONG else 20
+SPLITS_IN_RECORDING = 5
+KEPT_SPLITS = 6
+SLACK = 8192
 """Bytes of the heartbeat, of metadata and of carried messages that are about to be counted."""
-QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
+QUESTIONS: list[tuple[str, dict[str, Any]]] = [
     ("list_recorded_topics", {}),
     ("data_time_range", {}),
     ("get_position_seconds_ago", {"seconds_ago": 40}),

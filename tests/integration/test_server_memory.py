@@ -3,7 +3,7 @@
 import asyncio
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 from mcap.writer import CompressionType
@@ -15,22 +15,20 @@ from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S, until
 from tests.support.served import PROGRAM, Served, serving
 
-MB: Final = 1 << 20
-PROMISED_MB: Final = 512
+MB = 1 << 20
+PROMISED_MB = 512
 """What docs/security.md states, for the whole process."""
-CACHED_MB: Final = 160
+CACHED_MB = 160
 """What may stay: chunks (32 MB), columns (48 MB), and what the C library keeps of each arena."""
-AT_ONCE: Final = 8
-SHAPES: Final = {
+AT_ONCE = 8
+SHAPES = {
     "few": (24 if LONG else 6, 40 * MB, MB),
     "many": (3000 if LONG else 300, 400_000, MB),
     "together": (3000 if LONG else 200, 400_000, 60 * MB),
 }
 """How many messages of how many bytes, and the size of a chunk."""
-_BOTH: Final = (CompressionType.ZSTD, CompressionType.LZ4)
-TRIED: Final = (
-    [*product(SHAPES, _BOTH)] if LONG else [*zip(("together", "few"), _BOTH, strict=True)]
-)
+_BOTH = (CompressionType.ZSTD, CompressionType.LZ4)
+TRIED = [*product(SHAPES, _BOTH)] if LONG else [*zip(("together", "few"), _BOTH, strict=True)]
 
 
 def questions(count: int) -> list[tuple[str, dict[str, Any], str]]:
@@ -45,7 +43,7 @@ def questions(count: int) -> list[tuple[str, dict[str, Any], str]]:
 
 
 def memory_mb(served: Served, name: str) -> int:
-    status = Path(f"/proc/{served.process.pid}/status").read_text(encoding="ascii")
+    status = Path(f"/proc/{served.process.pid}/status").read_text()
     return int(next(line for line in status.splitlines() if name in line).split()[1]) >> 10
 
 

@@ -175,7 +175,7 @@ async def test_whoever_shows_the_token_is_answered_and_nobody_else(
         assert json.loads(served.get("/health")[1]) == {"status": "ok"}
         assert json.loads(served.get("/health", SHOWN)[1])["bags"] == 1
         _leave_traces(served)
-    output = (tmp_path / "log").read_text(encoding="utf-8")
+    output = (tmp_path / "log").read_text()
     assert '"event": "tool_call"' in output
     for secret in (GOOD, GOOD[:-2], "in-a-query"):
         assert secret not in output
@@ -247,6 +247,6 @@ async def test_a_token_decides_about_whom_is_answered(tmp_path: Path) -> None:
                 refused, _ = await ask(client, "list_frames", {"robot": "r2"})
                 assert ("error" in refused) is (token == site)
         assert served.get("/mcp")[0] == 401
-    output = log.read_text(encoding="utf-8")
+    output = log.read_text()
     assert site not in output
     assert office not in output

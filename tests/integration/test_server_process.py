@@ -105,7 +105,7 @@ async def replies(client: Client) -> list[tuple[str, str, bool]]:
 async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: Path) -> None:
     program, *arguments = command("logging.level=debug")
     alone = StdioServerParameters(command=program, args=arguments, env=environment(bag_dir))
-    with (tmp_path / "stdio").open("w", encoding="utf-8") as log:
+    with (tmp_path / "stdio").open("w") as log:
         async with Client(stdio_client(alone, errlog=log)) as client:
             await ask_everything(client)
             expected = await replies(client)
@@ -261,7 +261,7 @@ sys.meta_path.insert(0, Interrupting())
 def test_ctrl_c_while_a_program_imports_ends_it_without_a_traceback(
     tmp_path: Path, program: str, module: str
 ) -> None:
-    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING, encoding="utf-8")
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTING)
     path = shutil.which(program, path=Path(sys.executable).parent)
     assert path is not None
     ended = subprocess.run(

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import pytest
 import yaml
@@ -19,11 +18,11 @@ from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import end, publishing_robot
 from tests.support.served import Served
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-QUICK: Final = ("server.port=0", "recording.split_duration_s=1", "retention.min_free_gb=0")
-RADIUS: Final = 2.0  # m, of the circle that `tests/support/robot_publishers.py` drives on
-LEFT: Final = ["/camera/image_raw", "/speech", "/clock"]
-PROPOSED: Final = [
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = ("server.port=0", "recording.split_duration_s=1", "retention.min_free_gb=0")
+RADIUS = 2.0  # m, of the circle that `tests/support/robot_publishers.py` drives on
+LEFT = ["/camera/image_raw", "/speech", "/clock"]
+PROPOSED = [
     "/battery_state",
     "/bumper",
     "/cmd_vel",
