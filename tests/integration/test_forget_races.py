@@ -4,7 +4,6 @@ Nothing that a moment keeps is lost, nothing foreign is deleted, and nobody ends
 8 rounds; EPISODIC_LONG=1 makes it 24.
 """
 
-import hashlib
 import os
 import random
 import subprocess
@@ -32,17 +31,13 @@ SPLITS = 12
 T0 = time.time_ns() // S * S - 3600 * S
 
 
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 @dataclass
 class Robot:
     """A bag directory in which recordings come to lie whole, as the recorder's own."""
 
     bag_dir: Path
     workshop: Path
-    content: dict[str, str] = field(default_factory=dict)
+    content: dict[str, bytes] = field(default_factory=dict)
     kept: list[Outcome] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
 
@@ -53,7 +48,7 @@ class Robot:
             path = self.workshop / name / f"{name}_{split}.mcap"
             write_mcap(path, [odom(start + n * S // 20, n / 10, float(number)) for n in range(20)])
             os.utime(path, (T0 / S, T0 / S))
-            self.content[f"{name}/{path.name}"] = digest(path)
+            self.content[f"{name}/{path.name}"] = path.read_bytes()
         (self.workshop / name / "handover.json").write_text('{"format": 1}')
         identity = identity_of(self.workshop / name)
         assert identity is not None
@@ -82,7 +77,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
         write_mcap(robot.bag_dir / name, [odom(T0 + n * S, 1.0, 2.0) for n in range(500)])
         for name in ("session_mcap/session_0.mcap", "loose.mcap", "deep/er/x.mcap")
     ]
-    before = {path: digest(path) for path in foreign}
+    before = {path: path.read_bytes() for path in foreign}
     # A moment keeps what other programs recorded then, too.
     robot.content |= {str(path.relative_to(robot.bag_dir)): before[path] for path in foreign}
     robot.record(0)
@@ -122,7 +117,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
     ]
     assert wrong == []
     assert robot.faults == []
-    assert {path: digest(path) for path in foreign} == before
+    assert {path: path.read_bytes() for path in foreign} == before
     granted = [each for each in robot.kept if each.moment is not None]
     assert granted
     assert not [each.refused for each in robot.kept if "cannot be saved" in str(each.refused)]
@@ -130,7 +125,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
     for each in granted:
         held = moments[str(each.moment)]
         files = {
-            path.relative_to(held.folder).as_posix(): digest(path)
+            path.relative_to(held.folder).as_posix(): path.read_bytes()
             for path in held.folder.rglob("*.mcap")
         }
         assert files.items() <= robot.content.items()

@@ -5,10 +5,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 
@@ -30,6 +29,8 @@ DEAF = Patience(interrupt_s=0.2, terminate_s=PATIENCE_S, kill_s=PATIENCE_S)
 DEAFER = Patience(interrupt_s=0.2, terminate_s=0.2, kill_s=PATIENCE_S)
 LEAVING = "p = subprocess.Popen([sys.executable, '-IS', '-c', 'import time; time.sleep(600)'])\n"
 """It leaves a process behind, in its group."""
+Start = Callable[..., Child]
+"""A child that runs a program of some lines."""
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -43,13 +44,6 @@ def program(folder: Path, body: str) -> str:
     )
     path.chmod(0o755)
     return str(path)
-
-
-class Start(Protocol):
-    def __call__(
-        self, body: str, keep_open: tuple[int, ...] = (), patience: Patience = PATIENT
-    ) -> Child:
-        """A child that runs a program of these lines."""
 
 
 @pytest.fixture

@@ -215,37 +215,32 @@ async def test_a_token_decides_about_whom_is_answered(tmp_path: Path) -> None:
     with serving(tmp_path / "none", log, *given, **more) as served:
         for token, names in ((site, {"r1", "r3"}), (office, {*NAMES})):
             headers = {"Authorization": f"Bearer {token}"}
-            async with (
-                httpx2.AsyncClient(headers=headers) as shown,
-                Client(streamable_http_client(served.url("/mcp"), http_client=shown)) as client,
-            ):
-                found = await ask(client, "memory_status", {})
-                assert {row["robot_name"] for row in found[0]["robots"]} == names
-                found = await ask(client, "find_last_match", MUG)
-                rows = {row["robot_name"]: row["timestamp"] for row in found[0]["matches"]}
-                assert rows == {name: at for name, at in last.items() if name in names}
-                status = await client.read_resource("episodic://status")
-                assert ("r2" in str(status.contents)) is (token == office)
-                refused, _ = await ask(client, "list_frames", {"robot": "r2"})
-                assert ("error" in refused) is (token == site)
+            async with httpx2.AsyncClient(headers=headers) as shown:
+                streamed = streamable_http_client(served.url("/mcp"), http_client=shown)
+                for each in (streamed, sse_client(served.url("/sse"), headers=headers)):
+                    async with Client(each) as client:
+                        found, _ = await ask(client, "memory_status", {})
+                        assert {row["robot_name"] for row in found["robots"]} == names
+                        found, _ = await ask(client, "find_last_match", MUG)
+                        rows = {row["robot_name"]: row["timestamp"] for row in found["matches"]}
+                        assert rows == {name: at for name, at in last.items() if name in names}
+                        refused, _ = await ask(client, "list_frames", {"robot": "r2"})
+                        assert ("error" in refused) is (token == site)
+                        status = await client.read_resource("episodic://status")
+                        assert ("r2" in str(status.contents)) is (token == office)
+                        listed = [
+                            await client.list_tools(),
+                            await client.list_resources(),
+                            await client.list_resource_templates(),
+                            await client.list_prompts(),
+                            await client.get_prompt("use_memory"),
+                        ]
+                        assert "r2" not in str(listed)
                 health = json.loads((await shown.get(served.url("/health"))).text)
                 assert ("robots" in health) is (token == office)
                 for path in ("/page/span", "/metrics", "/"):
                     other = await shown.get(served.url(path))
                     assert other.status_code == (403 if token == site else 404)
-                listed = [
-                    await client.list_tools(),
-                    await client.list_resources(),
-                    await client.list_resource_templates(),
-                    await client.list_prompts(),
-                    await client.get_prompt("use_memory"),
-                ]
-                assert "r2" not in str(listed)
-            async with Client(sse_client(served.url("/sse"), headers=headers)) as client:
-                found = await ask(client, "data_time_range", {})
-                assert {row["robot_name"] for row in found[0]["robots"]} == names
-                refused, _ = await ask(client, "list_frames", {"robot": "r2"})
-                assert ("error" in refused) is (token == site)
         assert served.get("/mcp")[0] == 401
     output = log.read_text()
     assert site not in output

@@ -96,6 +96,12 @@ def test_the_browser_opens_where_somebody_sits_at_a_display(
     assert seen == ["http://127.0.0.1:1/"] * opened
 
 
+def clients_of(served: Served) -> tuple[Client, ...]:
+    """Of each transport over HTTP."""
+    streamed, events = served.url("/mcp"), sse_client(served.url("/sse"), timeout=PATIENCE_S)
+    return Client(streamed), Client(streamed, mode="legacy"), Client(events)
+
+
 async def replies(client: Client) -> list[tuple[str, str, bool]]:
     """Every tool's reply, and every kind of refusal, to the letter."""
     results = [(name, await client.call_tool(name, given)) for name, given in CALLS]
@@ -110,8 +116,7 @@ async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: P
             await ask_everything(client)
             expected = await replies(client)
     with serving(bag_dir, tmp_path / "log") as served:
-        streamed, events = served.url("/mcp"), sse_client(served.url("/sse"), timeout=PATIENCE_S)
-        for each in (Client(streamed), Client(streamed, mode="legacy"), Client(events)):
+        for each in clients_of(served):
             async with each as client:
                 assert await replies(client) == expected
         called = [each for each in served.events() if each["event"] == "tool_call"]
@@ -398,16 +403,13 @@ def posted(served: Served, name: str, accept: str, **meta: object) -> Any:
 BOTH = "application/json, text/event-stream"
 
 
-async def test_over_sse_and_streamable_http(bag_dir: Path, tmp_path: Path) -> None:
+async def test_progress_reaches_clients_of_every_transport(bag_dir: Path, tmp_path: Path) -> None:
     with serving(
         bag_dir, tmp_path / "log", program=[sys.executable, "-c", REPORTING, "data.now=latest"]
     ) as served:
-        async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
-            await asked_for_progress(client)
-        async with Client(served.url("/mcp")) as client:
-            await asked_for_progress(client)
-        async with Client(served.url("/mcp"), mode="legacy") as client:
-            await asked_for_progress(client)
+        for each in clients_of(served):
+            async with each as client:
+                await asked_for_progress(client)
         streamed = posted(served, SLOW, BOTH, progressToken="mine")
         assert streamed.headers["content-type"].startswith("text/event-stream")
         told = [json.loads(line[6:]) for line in streamed.text.splitlines() if line[:6] == "data: "]

@@ -52,12 +52,12 @@ HEARD = {
     "os.rename",
 }
 
-_heard: list[str] | None = None
+_heard: list[list[str]] = []
 
 
 def _hear(event: str, arguments: tuple[Any, ...]) -> None:
-    if _heard is not None and event in HEARD and isinstance(arguments[0], str | bytes | Path):
-        _heard.append(f"{event} {os.fsdecode(arguments[0])}")
+    if _heard and event in HEARD and isinstance(arguments[0], str | bytes | Path):
+        _heard[-1].append(f"{event} {os.fsdecode(arguments[0])}")
 
 
 sys.addaudithook(_hear)
@@ -66,12 +66,11 @@ sys.addaudithook(_hear)
 @contextmanager
 def hearing() -> Iterator[list[str]]:
     """What was opened, listed or deleted, by name."""
-    global _heard  # noqa: PLW0603  a hook cannot be taken away again
-    _heard = []
+    _heard.append([])  # a hook cannot be taken away again
     try:
-        yield _heard
+        yield _heard[-1]
     finally:
-        _heard = None
+        _heard.pop()
 
 
 @contextmanager
@@ -124,32 +123,30 @@ def untouched(folder: Path) -> Iterator[None]:
     assert contents() == before
 
 
-LINKS: dict[str, Any] = {
-    "a file": lambda bags, rec: (bags / "run/x.mcap").symlink_to(rec / "rec_0.mcap"),
-    "a db3 file": lambda bags, rec: (bags / "x.db3").symlink_to(rec / "rec_1.db3"),
-    "a directory": lambda bags, rec: (bags / "rec").symlink_to(rec),
-    "a relative one": lambda bags, rec: (bags / "relative").symlink_to("../outside/rec"),
-    "a directory of directories": lambda bags, rec: (bags / "more").symlink_to(rec.parent),
-    "a chain": lambda bags, rec: [
-        (bags / "one").symlink_to(rec),
-        (bags / "two").symlink_to("one"),
-        (bags / "x.mcap").symlink_to("two/rec_0.mcap"),
-    ],
-    "the store's folder": lambda bags, rec: (bags / ".episodic").symlink_to(rec),
-    "metadata": lambda bags, rec: (bags / "run/metadata.yaml").symlink_to(rec / "metadata.yaml"),
-    "a journal": lambda bags, rec: [
-        write_db3(bags / "own.db3", [boolean(T0, data=True)]),
-        (bags / "own.db3-wal").symlink_to(rec / "rec_1.db3"),
-    ],
+LINKS = {
+    "run/x.mcap": "rec_0.mcap",
+    "x.db3": "rec_1.db3",
+    "rec": "",
+    "more": "..",
+    "one": "",
+    "run/metadata.yaml": "metadata.yaml",
+    "own.db3-wal": "rec_1.db3",
 }
+"""From a bag directory to what lies outside."""
+RELATIVE_LINKS = {"relative": "../outside/rec", "two": "one", "x.mcap": "two/rec_0.mcap"}
 
 
 @pytest.fixture(params=["the store's folder", "all others"])
 def linked(request: pytest.FixtureRequest, bags: Path, outside: Path) -> None:
     """Links in the bag directory; through that of the store's folder nothing is stored."""
-    for name, link in LINKS.items():
-        if (name == "the store's folder") == (request.param == name):
-            link(bags, outside)
+    if request.param == "the store's folder":
+        (bags / ".episodic").symlink_to(outside)
+        return
+    write_db3(bags / "own.db3", [boolean(T0, data=True)])
+    for name, target in LINKS.items():
+        (bags / name).symlink_to(outside / target)
+    for name, target in RELATIVE_LINKS.items():
+        (bags / name).symlink_to(target)
 
 
 @pytest.mark.usefixtures("linked")

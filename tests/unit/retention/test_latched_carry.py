@@ -6,15 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.core.errors import BagError, BagUnreachableError, NoDataError
+from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import AtTime
+from ros2_memory.history.context import Memory
 from ros2_memory.retention.latched_carry import (
     RECEIVED_AGAIN_NS,
     Latched,
@@ -29,7 +26,7 @@ from tests.support.clocks import SettableClock
 from tests.support.fakes import broken, killed_at
 from tests.support.housekeepers import files_in, keeper_of
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 from tests.support.noting_reader import fail_reading
 
 S = 10**9
@@ -83,29 +80,16 @@ def keep_only(bag_dir: Path, *kept: str) -> None:
     assert sorted(path.relative_to(bag_dir).as_posix() for path in left) == sorted(kept)
 
 
-def at(moment: int) -> AtTime:
-    return AtTime(at_s=unix_from_ns(moment))
-
-
-def held(memory: Memory, topic: str, moment: int) -> tuple[int, object] | str:
+def held(memory: Memory, topic: str, moment: int) -> tuple[float, object] | str:
     """What a topic held, and since when; or why that is not known."""
-    try:
-        answer = queries.topic_value(memory, Call(), topic, at(moment))
-    except NoDataError as error:
-        return error.reason
-    return answer.sample.time, answer.sample.value
+    reply = asked(memory, "get_topic_at_time", topic=topic, timestamp=moment / S)
+    return reply["reason"] if "error" in reply else (reply["timestamp"], reply["value"])
 
 
 def places(memory: Memory, moment: int, children: Iterable[str]) -> list[object]:
-    found: list[object] = []
-    for child in children:
-        try:
-            answer = queries.transform(memory, Call(), "base_link", child, at(moment))
-        except NoDataError as error:
-            found.append(error.reason)
-        else:
-            found.append(answer.transform.translation)
-    return found
+    frames = {"parent": "base_link", "timestamp": moment / S}
+    replies = [asked(memory, "get_transform_at", child=child, **frames) for child in children]
+    return [reply.get("translation", reply.get("reason")) for reply in replies]
 
 
 def test_a_carried_message_keeps_its_bytes_times_definition_and_qos(tmp_path: Path) -> None:
@@ -140,7 +124,7 @@ def test_where_latched_messages_cannot_be_carried_bags_without_them_go_instead(
         keeper_of(tmp_path, max_bytes=1).apply()
     assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
     keeper_of(tmp_path, max_bytes=1).apply()
-    assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0, {"value": "home"})
+    assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0 / S, {"value": "home"})
 
 
 def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(tmp_path: Path) -> None:
@@ -171,7 +155,7 @@ def test_a_bag_of_latched_messages_goes_at_once_where_no_other_can_go_in_its_pla
     else:
         keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply()
     assert "rec/rec_0.mcap" not in files_in(tmp_path)
-    assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
+    assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0 / S, {"value": "home"})
 
 
 def test_a_bag_stays_while_the_disk_fails_to_give_its_latched_messages(
@@ -280,9 +264,9 @@ def test_answers_about_latched_topics_are_the_same_after_as_before_a_deletion(
 
 def test_carried_messages_say_nothing_of_when_there_was_a_recording(bag_dir: Path) -> None:
     keep_only(bag_dir, "six_more/six_more_0.mcap", "six/six_1.mcap")
-    reported = queries.data_time_range(memory_of(bag_dir), Call())
-    assert reported.earliest == T0 + 250 * S
-    assert (reported.bags, reported.gaps) == (2, ())
+    reported = asked(memory_of(bag_dir), "data_time_range")
+    assert reported["earliest"] == T0 / S + 250
+    assert (reported["bags"], reported["gaps"]) == (2, [])
 
 
 @given(st.data())
