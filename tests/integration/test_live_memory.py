@@ -166,8 +166,8 @@ def _look_back(drive: Drive, served: dict[str, Served]) -> None:
     files = bag_files(drive.rotating.bag_dir)
     drive.recorded = [tick.log_time for tick in ticks(files, drive.t0, HZ)]
     recordings = groupby(files, key=lambda file: file.parent)
-    found = [ticks([*own], drive.t0, HZ, counting=False) for _, own in recordings]
-    drive.copies = [*filter(None, found)]
+    copies = (ticks([*own], drive.t0, HZ, counting=False) for _, own in recordings)
+    drive.copies = [*filter(None, copies)]
     wanted = {"condition_type": "contains", "value": "scissors", "fields": "header.stamp"}
     found = ("find_last_match", {"topic": "/vision/*/scene_objects", **wanted})
     for name in ("rotating", "killed"):

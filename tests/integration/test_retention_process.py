@@ -73,7 +73,8 @@ def content_of(begin: int, nth: int) -> bytes:
 
 def splits_of(bag_dir: Path, begin: int) -> Iterator[Path]:
     """Writes splits that are dated from `begin` on; yields the newest, which is open."""
-    path, rest = None, b""
+    path: Path | None = None
+    rest = b""
     for nth in range(SPLITS):
         content = content_of(begin, nth)
         # It reaches the disk in two parts, as a recorder's does.

@@ -351,14 +351,19 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found
 
 
-def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
+def test_recordings_without_a_last_word_are_repaired_once_the_disk_has_room(tmp_path: Path) -> None:
     open_one = left_open(tmp_path / A / f"{A}_0.mcap")
     empty = tmp_path / A / f"{A}_1.mcap"
     empty.write_bytes(b"")
     (tmp_path / A / "metadata.yaml").touch()  # as on a disk that was full
     readable = McapReader().summarize(open_one).topics
+    free = Mock(return_value=1000)
+    keeper = keeper_of(tmp_path, measure_free=free)
     with capture_logs() as captured:
-        keeper_of(tmp_path).apply()
+        with broken(McapWriter, "rewrite"):
+            keeper.apply()
+        free.return_value = PLENTY
+        keeper.apply()
     after = McapReader().summarize(open_one)
     assert (after.complete, after.topics) == (True, readable)
     assert not empty.exists()
@@ -367,17 +372,6 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     newest = max(topic.last for topic in after.topics) / 1e9
     assert f"the newest message is of {newest:.3f}; later ones that had not" in reported["reason"]
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
-
-
-def test_what_a_full_disk_leaves_unrepaired_is_repaired_when_there_is_room(tmp_path: Path) -> None:
-    open_one = left_open(tmp_path / A / f"{A}_0.mcap")
-    free = Mock(return_value=1000)
-    keeper = keeper_of(tmp_path, measure_free=free)
-    with broken(McapWriter, "rewrite"):
-        keeper.apply()
-    free.return_value = PLENTY
-    keeper.apply()
-    assert McapReader().summarize(open_one).complete
 
 
 def test_a_recording_of_another_is_left_alone_until_it_lay_still_and_nobody_holds_it(

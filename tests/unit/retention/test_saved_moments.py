@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.moment_file import RequestQueue, stored_moments_in
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime
@@ -93,7 +93,11 @@ def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(tmp_p
     assert "nothing was recorded then" in refusal(500, 600)
     with broken(os, "link", errno.EPERM):
         assert "no hard link can be made: Operation not permitted" in refusal(15, 25)
-    assert not [*(tmp_path / "moments").glob("*")]
+    moments = tmp_path / "moments"
+    with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
+        why = f"the bags cannot be saved in {moments}: Input/output error"
+        assert refusal(15, 25) == why
+    assert not [*moments.glob("*")]
     assert lines(tmp_path) == []
     # A bag that two moments share counts once in the share.
     assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
@@ -107,21 +111,6 @@ def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(tmp_p
     assert files_in(tmp_path.parent / "else") == before
 
 
-def test_a_request_is_not_granted_twice(tmp_path: Path) -> None:
-    """As where the recorder was killed after it kept a moment, and before it answered."""
-    recording(tmp_path, A, 0)
-    pending = asked(tmp_path, 15, 25)
-    request = tmp_path / REQUESTS_FOLDER / f"{pending.request.number}.json"
-    text = request.read_text()
-    house_of(tmp_path).keep_moments()
-    first = pending.outcome()
-    pending.close()
-    request.with_suffix(".taken").write_text(text)
-    house_of(tmp_path).keep_moments()
-    assert pending.outcome() == first
-    assert len(list(stored_moments_in(tmp_path))) == 1
-
-
 def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
     tmp_path: Path,
 ) -> None:
@@ -132,16 +121,6 @@ def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
     assert kept(house, tmp_path, 2, 7, "two").bags == 1
     one, two = in_moments(tmp_path)
     assert one.partition("/")[2] == two.partition("/")[2] == f"{A}/{A}_0.mcap"
-
-
-def test_of_a_moment_that_the_disk_refuses_at_its_last_step_nothing_is_left(tmp_path: Path) -> None:
-    recording(tmp_path, A, 0)
-    house, moments = house_of(tmp_path), tmp_path / "moments"
-    with broken(saved_moments, "flush", errno.EIO, where=lambda path: path == moments):
-        outcome = kept(house, tmp_path, 15, 25)
-    assert outcome.refused == f"the bags cannot be saved in {moments}: Input/output error"
-    assert not list(stored_moments_in(tmp_path))
-    assert lines(tmp_path) == []
 
 
 def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
@@ -224,19 +203,24 @@ def test_before_anything_is_deleted_a_pending_moment_goes_on(tmp_path: Path) -> 
     assert told_of(tmp_path)["complete"] is True
 
 
-@pytest.mark.parametrize("step", ["link", "write_saved_moment"])
+@pytest.mark.parametrize(
+    ("owner", "step", "nth"),
+    [(os, "link", 2), (saved_moments, "write_saved_moment", 2), (RequestQueue, "answer", 1)],
+)
 def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, step: str, nth: int
 ) -> None:
-    """It dies as it makes its second link, or writes what it made for the second time."""
+    """It dies at its second link, as it writes what it made for the second time, or answers.
+
+    No request is granted twice.
+    """
     recording(tmp_path, A, 0)
     pending = asked(tmp_path, 15, 25)
-    owner: Any = os if step == "link" else saved_moments
     done, real = [], getattr(owner, step)
 
     def killed(*given: Any, **options: Any) -> None:
         done.append(step)
-        if len(done) == 2:
+        if len(done) == nth:
             raise KeyboardInterrupt
         real(*given, **options)
 

@@ -172,21 +172,6 @@ def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: Screened
     assert bags.seconds("/map") == [55.0]
 
 
-def test_a_full_disk_holds_splits_back(bags: ScreenedBags) -> None:
-    name = bags.begin(0)
-    split = bags.split(name, [off(-2), on(5), *words(0, 10)])
-
-    with broken(McapWriter, "cut"):
-        bags.end()
-        assert bags.served() == []
-        problem = bags.screening.problem() or ""
-        assert "1 split is not served" in problem
-        assert f"{name}/{split.name}: No space left on device" in problem
-        assert [each.name for each in split.parent.iterdir()] == [split.name]
-    bags.end()
-    assert (bags.seconds(), bags.screening.problem()) == (halves(0, 4), None)
-
-
 def test_a_split_that_cannot_be_read_stays_held_back(bags: ScreenedBags) -> None:
     name = bags.begin(0)
     bags.split(name, [off(-2), *words(0, 10)])
@@ -230,7 +215,7 @@ def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(bags: Scre
     assert f"{name}/theirs_0.mcap" in (bags.screening.problem() or "")
 
 
-def test_a_state_that_cannot_be_written_or_read_changes_and_serves_nothing(
+def test_a_full_disk_or_a_state_that_cannot_be_read_changes_and_serves_nothing(
     bags: ScreenedBags,
 ) -> None:
     name = bags.begin(0)
@@ -243,8 +228,15 @@ def test_a_state_that_cannot_be_written_or_read_changes_and_serves_nothing(
         with pytest.raises(RecorderError, match=r"screened\.json: No space"):
             bags.begin(20)
     assert (split.read_bytes(), bags.served()) == (before, [])
+    # Nor does a full disk on which a split cannot be cut.
+    with broken(McapWriter, "cut"):
+        bags.end()
+        problem = bags.screening.problem() or ""
+        assert "1 split is not served" in problem
+        assert f"{name}/{split.name}: No space left on device" in problem
+        assert ([*split.parent.iterdir()], bags.served()) == ([split], [])
     bags.end()
-    assert bags.seconds() == halves(0, 4)
+    assert (bags.seconds(), bags.screening.problem()) == (halves(0, 4), None)
     # One that is damaged serves nothing, and begins nothing.
     (bags.bag_dir / SCREENED_FILE).write_text("{")
     assert bags.served() == []
