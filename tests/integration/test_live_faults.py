@@ -208,7 +208,8 @@ def _kill(
     counts = {row["topic"]: row["count"] for row in listed if "topic" in row}
     off_m = 0.0
     # A float of seconds does not tell messages apart that were logged within a microsecond.
-    if asked_for := alone(closed):
+    near = Counter(tick.log_time // 10**6 for tick in closed)
+    if asked_for := [tick for tick in closed if near[tick.log_time // 10**6] == 1]:
         chosen = chance.choice(asked_for)
         told = answer(served, "get_position_at", timestamp=chosen.log_time / NS_PER_S)
         x, y = position(chosen.number / hz)
@@ -244,18 +245,6 @@ def _bytes_of(files: Sequence[Path]) -> int:
             for record in reader.records(path, topics, TimeWindow.everything()):
                 total += len(record.payload) + RECORD_OVERHEAD_BYTES
     return total
-
-
-def alone(among: Sequence[Tick]) -> list[Tick]:
-    """The messages within a millisecond of which no other was logged."""
-    ordered = sorted(among, key=lambda tick: tick.log_time)
-    near = {
-        tick
-        for before, after in pairwise(ordered)
-        if after.log_time - before.log_time < NS_PER_S // 1000
-        for tick in (before, after)
-    }
-    return [tick for tick in among if tick not in near]
 
 
 KILLS = 50 if LONG else 6

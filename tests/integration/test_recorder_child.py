@@ -231,6 +231,8 @@ def test_a_program_that_is_not_there_says_so_and_ends() -> None:
     child = Child.start(["/nowhere/ros2", "bag"], ENV)
     assert finished(child) == 127
     assert child.take_lines() == ["/nowhere/ros2: No such file or directory"]
+    with pytest.raises(RecorderError, match="/nowhere/x cannot be started: No such file"):
+        run_bounded(["/nowhere/x"], ENV, PATIENCE_S)
 
 
 def test_another_thread_than_the_main_one_may_not_start_it(start: Start) -> None:
@@ -288,8 +290,3 @@ def test_a_bounded_run_does_not_wait_for_what_goes_on_in_the_background(tmp_path
     ran = run_bounded([program(tmp_path, f"{LEAVING}print(p.pid)")], ENV, PATIENCE_S)
     assert ran.returncode == 0
     os.kill(int(ran.stdout), signal.SIGKILL)
-
-
-def test_a_bounded_run_of_a_program_that_is_not_there_names_it() -> None:
-    with pytest.raises(RecorderError, match="/nowhere/x cannot be started: No such file"):
-        run_bounded(["/nowhere/x"], ENV, PATIENCE_S)
