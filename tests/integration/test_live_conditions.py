@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import pytest
@@ -29,7 +28,7 @@ from tests.support.ros_processes import (
     publishing_robot,
     wait_for,
 )
-from tests.timing import in_time
+from tests.timing import each_in_time
 
 NOBODY = "65534"
 needs_another_user = pytest.mark.skipif(
@@ -114,18 +113,14 @@ def fill(disk: Path) -> Path:
 
 
 @pytest.mark.parametrize("least", ["0.001", "0"])
+@each_in_time
 def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_room(
     site: Machine, robot: Robot, tmp_path: Path, least: str
 ) -> None:
-    in_time(lambda: fill_up(site, robot, Path(mkdtemp(dir=tmp_path)), least))
-
-
-def fill_up(site: Machine, robot: Robot, folder: Path, least: str) -> None:
-    """Fills the disk that is recorded onto, and makes room."""
     guarded = least != "0"
-    with small_disk(folder / "disk") as disk:
+    with small_disk(tmp_path / "disk") as disk:
         recorder = site.record(
-            f"full{least}{folder.name}",
+            f"full{least}{tmp_path.name}",
             "recording.split_duration_s=1",
             f"retention.min_free_gb={least}",
             bag_dir=disk / "bags",

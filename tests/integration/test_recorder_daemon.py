@@ -375,11 +375,6 @@ def complete(bag_dir: Path) -> StoredMoment:
     return until(is_complete)
 
 
-def originals(held: StoredMoment, bag_dir: Path) -> list[Path]:
-    """Where the bags of a moment were recorded."""
-    return [bag_dir / path.relative_to(held.folder) for path in held.folder.rglob("*.mcap")]
-
-
 def about(served: Served, reply: dict[str, Any]) -> list[Any]:
     """Answers about the time of a moment; without the notes, which say what is open just now."""
     given = {"topic": "/odom", "start": reply["start"], "end": reply["end"], "max_samples": 7}
@@ -405,9 +400,16 @@ def keeps_a_moment(site: Site, served: Served) -> None:
     assert (reply["label"], reply["bags"] >= 2) == ("Küche", True), reply
     held = complete(site.bag_dir)
     assert (held.folder.name, held.moment.missing) == (reply["moment"], ())
-    recorded = originals(held, site.bag_dir)
+    # Where its bags were recorded.
+    recorded = [site.bag_dir / bag.relative_to(held.folder) for bag in held.folder.rglob("*.mcap")]
     assert len(recorded) >= 3
-    before = until(lambda: _whole(about(served, reply)))
+
+    def whole() -> list[Any] | None:
+        """Answers in which the newest split has its part, too."""
+        answers = about(served, reply)
+        return answers if answers[0].get("total", 0) >= 240 else None
+
+    before = until(whole)
     assert all(path.exists() for path in recorded)
     until(lambda: not any(path.exists() for path in recorded))
     assert about(served, reply) == before
@@ -459,8 +461,3 @@ def test_rules_save_moments_over_a_rotation_and_a_kill(site: Site) -> None:
 
     until(complete)
     following.stop()
-
-
-def _whole(answers: list[Any]) -> list[Any] | None:
-    """Answers in which the newest split has its part, too."""
-    return answers if "total" in answers[0] and answers[0]["total"] >= 240 else None

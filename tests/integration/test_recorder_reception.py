@@ -6,12 +6,10 @@ Seconds of load; EPISODIC_LONG=1 makes it an hour of 10 topics at 200 Hz, and tw
 import os
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import yaml
 from mcap.reader import make_reader
@@ -35,9 +33,8 @@ from tests.support.live_recorder import (
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import end, wait_for
-from tests.timing import Watch, driven, each_in_time
+from tests.timing import each_in_time
 
-TOPICS = ("/odom", "/scan", "/watched")
 STALLS_S = (0.2, 0.3, 0.5, 1.0)
 LOSING_S = 3.0
 """A stall of 1 s may lose nothing: DDS keeps it. One of 5 s is taken for a silent publisher."""
@@ -61,39 +58,18 @@ def overrides(recorder: LiveRecorder) -> dict[str, dict[str, object]]:
     return found
 
 
-class Stalled(NamedTuple):
-    """A recorder that was stalled after a rotation had given it deep queues."""
+@each_in_time
+def test_a_stalled_recorder_loses_nothing_once_its_queues_are_deep(
+    real_recorder: RealRecorder, tmp_path: Path
+) -> None:
+    """Reliable, best effort and with a deadline: one rotation after the first closed split.
 
-    watch: Watch
-    profiles: Mapping[str, Mapping[str, object]]
-    received: Mapping[str, list[int]]
-    """The numbers that it recorded of each topic since that rotation."""
-
-
-def test_a_stalled_recorder_loses_nothing_once_its_queues_are_deep(site: Machine) -> None:
-    """Reliable, best effort and with a deadline: one rotation after the first closed split."""
-    stalled = driven(partial(_stalled, site), _lost_nothing)
-    assert {topic: each["reliability"] for topic, each in stalled.profiles.items()} == {
-        "/odom": "reliable",
-        "/scan": "best_effort",
-        "/watched": "reliable",
-        "/tf_static": "reliable",
-    }
-    assert int(str(stalled.profiles["/odom"]["depth"])) >= 200
-    # A deadline that is asked for refuses every publisher without one.
-    assert "deadline" not in stalled.profiles["/watched"]
-    with stalled.watch.excusing():
-        _lost_nothing(stalled)
-
-
-def _stalled(site: Machine, watch: Watch) -> Stalled:
+    The queues hold two seconds: more than the stalls, and what the machine adds to them.
+    """
     robot = ("/odom:100:reliable", "/scan:50:best_effort", "/watched:20:reliable:deadline")
-    with publishing(site.env, *robot):
-        recorder = site.record(
-            f"deep{len(site.recorders)}",
-            "recording.split_duration_s=1",
-            topics=(*TOPICS, "/tf_static"),
-        )
+    topics = ("/odom", "/scan", "/watched", "/tf_static")
+    with machine(tmp_path, real_recorder) as site, publishing(site.env, *robot):
+        recorder = site.record("deep", "recording.split_duration_s=1", topics=topics)
         [deepened] = recorder.wait_for("queues_deepened")
         assert "/odom" in deepened["reason"]
         assert "/scan" in deepened["reason"]
@@ -103,19 +79,20 @@ def _stalled(site: Machine, watch: Watch) -> Stalled:
             stall(recorder, seconds)
             recorder.wait_for("split_closed", before + 1)
         recorder.stop()
-    after = numbers(recorder.bag_dir, rotated["next"])
-    found = numbers(recorder.bag_dir)
-    received = {topic: each[each.index(after[topic][0]) :] for topic, each in found.items()}
-    return Stalled(watch, overrides(recorder), received)
-
-
-def _lost_nothing(stalled: Stalled) -> None:
-    """The queues hold two seconds: more than the stalls, and what the machine adds to them."""
-    assert stalled.received.keys() == set(TOPICS)
-    for topic, received in stalled.received.items():
+    profiles = overrides(recorder)
+    assert {topic: each["reliability"] for topic, each in profiles.items()} == {
+        **dict.fromkeys(topics, "reliable"),
+        "/scan": "best_effort",
+    }
+    assert int(str(profiles["/odom"]["depth"])) >= 200
+    # A deadline that is asked for refuses every publisher without one.
+    assert "deadline" not in profiles["/watched"]
+    after, found = numbers(recorder.bag_dir, rotated["next"]), numbers(recorder.bag_dir)
+    assert found.keys() == {*topics} - {"/tf_static"}
+    for topic, each in found.items():
+        received = each[each.index(after[topic][0]) :]
         assert len(received) > 50, topic
-        holes = [pair for pair in pairwise(received) if pair[1] != pair[0] + 1]
-        assert holes == [], topic
+        assert received == [*range(received[0], received[-1] + 1)], topic
 
 
 def test_a_publisher_that_comes_with_weaker_qos_is_recorded_at_once(site: Machine) -> None:

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from ros2_memory.bag_dir.state_files import LEAVING, Leaving
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Memory, QuerySettings
 from tests.integration.test_recorder_daemon import Site, sited
-from tests.support.bags import McapLayout, Msg, mcap_content, odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, mcap_content, odom, text, tf, transform, write_mcap
 from tests.support.examples import LONG
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of, own_all, size_of, state
@@ -65,8 +66,8 @@ def content_of(begin: int, nth: int) -> bytes:
     messages = [odom(at, (at - begin) / NS_PER_S, 0.0, vx=1.0) for at in times]
     messages += [text(start + 20 + n * NS_PER_S, f"word {n}") for n in range(10)]
     if nth % SPLITS_IN_RECORDING == 0:
-        where, fixed = text(begin, "home", DOCK), transform(begin, "base_link", "laser", (1, 0, 2))
-        messages.append(Msg(DOCK, where.type, start + 1, where.body, begin))
+        fixed = transform(begin, "base_link", "laser", (1, 0, 2))
+        messages.append(replace(text(begin, "home", DOCK), log_time=start + 1, publish_time=begin))
         messages.append(tf(begin, fixed, topic="/tf_static", log_time=start + 2))
     return mcap_content(messages, LAYOUT)
 

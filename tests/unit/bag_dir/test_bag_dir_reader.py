@@ -6,6 +6,7 @@ What counts is in `handover.json`; a bag that moments keep counts once.
 import json
 import os
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,7 +44,7 @@ def taken_over(bag_dir: Path) -> tuple[Path, Path]:
 
     def message(n: int, late: int) -> Msg:
         at = T0 + n * S // 2
-        return Msg("/bumper", "std_msgs/msg/Bool", at + late, boolean(at, data=True).body, at)
+        return replace(boolean(at + late, data=True), publish_time=at)
 
     old = write_mcap(bag_dir / "a" / "a_0.mcap", [message(n, 0) for n in range(20)])
     new = write_mcap(bag_dir / "b" / "b_0.mcap", [message(n, LATE) for n in range(12, 40)])
@@ -63,7 +64,7 @@ def counting(bag_dir: Path) -> Memory:
 
 def test_a_latched_message_received_again_is_not_cut_off(tmp_path: Path) -> None:
     docked = text(T0, "docked", "/dock")
-    again = Msg(docked.topic, docked.type, T0 + 9 * S, docked.body, docked.log_time)
+    again = replace(docked, log_time=T0 + 9 * S, publish_time=T0)
     layout = McapLayout(latched=frozenset({"/dock"}))
     new = write_mcap(tmp_path / "b" / "b_0.mcap", [again], layout)
     begin = Overlap(None, None, ("b_0.mcap",))
@@ -98,7 +99,7 @@ def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> Non
     def message(topic: str) -> Msg:
         at = moment()
         body = boolean(at, data=True) if draw.random() < 0.7 else text(at, "also of this name")
-        return Msg(topic, body.type, at, body.body, at - draw.randrange(-2, 3) * S // 4)
+        return replace(body, topic=topic, publish_time=at - draw.randrange(-2, 3) * S // 4)
 
     messages = [message(draw.choice(["/bumper", "/other"])) for _ in range(60)]
     layout = McapLayout(chunk_size=draw.choice([200, 1000, 1 << 20]))

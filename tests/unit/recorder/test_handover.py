@@ -6,6 +6,7 @@ What either of them holds counts, and once.
 import itertools
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,10 +85,11 @@ class Recorder(NamedTuple):
                 continue
             stall = next((s for s in self.stalls if s.at <= each.at < s.at + s.lasts), None)
             at = each.at if stall is None else stall.at + stall.lasts
-            made = text(T0, str(each.number), each.topic)
-            log_time = T0 + round(at * S) + self.delay_ns
-            publish_time = T0 + round((each.at + self.skew_s) * S)
-            message = Msg(each.topic, made.type, log_time, made.body, publish_time)
+            message = replace(
+                text(T0, str(each.number), each.topic),
+                log_time=T0 + round(at * S) + self.delay_ns,
+                publish_time=T0 + round((each.at + self.skew_s) * S),
+            )
             if stall is None:
                 received.append(message)
             else:
@@ -274,10 +276,9 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
 ) -> None:
     for name, start, stop in (("a", 0.0, 7.5), ("b", 4.0, 13.0)):
         messages = Recorder(start, stop, delay_ns=0).receives(publications(13))
-        publish = [0 if published_at == "zero" else each.log_time for each in messages]
         written = [
-            Msg(each.topic, each.type, each.log_time, each.body, at)
-            for each, at in zip(messages, publish, strict=True)
+            replace(each, publish_time=0 if published_at == "zero" else each.log_time)
+            for each in messages
         ]
         write_mcap(tmp_path / name / f"{name}_0.mcap", written, LAYOUT)
     hand_over(tmp_path, 5, clock=CutClock.LOG)
@@ -316,8 +317,7 @@ def test_where_too_many_would_be_listed_all_count(
 
 
 def bump(published: int, delay: int) -> Msg:
-    made = boolean(published, True)
-    return Msg(made.topic, made.type, published + delay, made.body, published)
+    return replace(boolean(published + delay, True), publish_time=published)
 
 
 def cut_recording(bag_dir: Path, name: str, start: float, stop: float, *, delay: int) -> Path:

@@ -1,7 +1,7 @@
 """Which messages of a topic stay of a day: what changes, what is seen, and enough of the rest."""
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,12 @@ def cut(messages: Sequence[Msg], at: Sequence[int]) -> list[Sequence[Msg]]:
     edges = [0, *sorted(at), len(messages)]
     parts = [messages[a:b] for a, b in pairwise(edges)]
     return [part for part in parts if part]
+
+
+def by_slot(count: int, step: int, length: int) -> list[list[int]]:
+    """The numbers of so many messages, one each step (ns), by slots of a length."""
+    slots = groupby(range(count), key=lambda n: (T0 + n * step) // length)
+    return [[*inside] for _, inside in slots]
 
 
 def test_a_robot_that_drives_has_a_pose_a_second_and_one_that_stands_half_as_many(
@@ -130,10 +136,8 @@ def test_the_extremes_of_numbers_stay(tmp_path: Path) -> None:
     for numbers_ns in (THINNED_NS, MINUTE_NS):
         parts = cut(messages, range(200, 3000, 200))
         stays = {2 * t // S for t in times_that_stay(tmp_path, parts, numbers_ns=numbers_ns)}
-        slots: dict[int, list[int]] = {}
-        for n in range(3000):
-            slots.setdefault((T0 + n * S // 2) // EXTREMES_NS, []).append(n)
-        for inside in slots.values():
+        slots = by_slot(3000, S // 2, EXTREMES_NS)
+        for inside in slots:
             assert min(inside, key=numbers.__getitem__) in stays
             assert max(inside, key=numbers.__getitem__) in stays
         assert len(stays) <= 1500 * S // numbers_ns + 2 * len(slots) + 2
@@ -146,10 +150,7 @@ def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path)
     seen = [[label for label in there if chance.random() < 0.3] for _ in range(500)]
     messages = [detections(T0 + n * S // 5, labels) for n, labels in enumerate(seen)]
     stays = {5 * t // S for t in times_that_stay(tmp_path, cut(messages, [130, 133, 350]))}
-    slots: dict[int, list[int]] = {}
-    for n in range(500):
-        slots.setdefault((T0 + n * S // 5) // THINNED_NS, []).append(n)
-    for inside in slots.values():
+    for inside in by_slot(500, S // 5, THINNED_NS):
         for label in there:
             most = max(seen[n].count(label) for n in inside)
             assert max(seen[n].count(label) for n in inside if n in stays) == most

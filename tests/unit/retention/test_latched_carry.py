@@ -40,13 +40,12 @@ def frame(at: int, child: str, x: float, *, received: int | None = None) -> Msg:
         at,
         transform(at, "base_link", child, (x, 0.0, 0.0)),
         topic="/tf_static",
-        log_time=at if received is None else received,
+        log_time=received or at,
     )
 
 
 def docked(at: int, where: str, *, received: int | None = None) -> Msg:
-    message = text(at, where, DOCK)
-    return Msg(DOCK, message.type, at if received is None else received, message.body, at)
+    return replace(text(received or at, where, DOCK), publish_time=at)
 
 
 def drive(start: int, stop: int) -> list[Msg]:

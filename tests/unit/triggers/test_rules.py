@@ -1,6 +1,7 @@
 """When rules fire: over streams of messages alone, and over splits and rotations."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -123,8 +124,7 @@ VALUES = st.lists(st.sampled_from([True, True, True, False]), min_size=4, max_si
 
 def published(at: int, value: bool, late: int) -> Msg:
     """A message that is received so many milliseconds after it was published."""
-    made = boolean(at + late * 1_000_000, value)
-    return Msg(made.topic, made.type, made.log_time, made.body, at)
+    return replace(boolean(at + late * 1_000_000, value), publish_time=at)
 
 
 @settings(max_examples=examples(15), deadline=None)

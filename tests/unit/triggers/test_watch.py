@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.triggers.rules import Rule
-from tests.support.bags import McapLayout, Msg, boolean, text
+from tests.support.bags import McapLayout, Msg, text
 from tests.support.fakes import broken
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
@@ -75,14 +75,14 @@ def test_a_rule_begins_with_what_is_recorded_from_now_on(robot: WatchedBags) -> 
 
 def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
     robot.begin(T0)
-    said = Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, boolean(0, True).body, T0 + 5 * S - 1)
+    said = replace(flag(5, True), publish_time=T0 + 5 * S - 1)
     # Nor does what was published long before.
     old = replace(flag(1, True), publish_time=T0 - 60 * S)
     robot.split([text(T0, "a"), old, flag(3, False), said, text(T0 + 9 * S, "b")], layout=LATCHED)
     for at in (10, 20, 30):
         before, new = robot.names[-1], robot.begin(T0 + at * S)
         robot.hand_over(before, new, T0 + at * S, f"{before}_0.mcap")
-        again = Msg(said.topic, said.type, T0 + at * S + 1, said.body, said.publish_time)
+        again = replace(said, log_time=T0 + at * S + 1)
         robot.split([again, text(T0 + (at + 5) * S, "c")], layout=LATCHED)
         robot.look()
     robot.close_all()
