@@ -124,6 +124,9 @@ def test_a_first_look_is_four_requests_and_shows_the_memory_at_a_glance(page: Br
     assert all(each in state for each in ("damaged_0.mcap", "Recorder\nno heartbeat yet", "GB"))
     label = page.run("return document.getElementById('map').getAttribute('aria-label')")
     assert all(each in label for each in ("30.0 m driven in odom", "2 stops"))
+    # Nothing green stands above something red.
+    assert state.startswith("! Damaged bags")
+    assert page.run("return document.querySelectorAll('#state .good').length") == 0
     # Nobody knows how it came over the gap.
     assert page.run("return [...map.paths[0].starts].length") == 2
     assert "stood at x 15.00, y 0.00" in events
@@ -368,6 +371,17 @@ RECKONED: dict[str, tuple[str, object]] = {
         """,
         [4, "a gap"],
     ),
+    "what is amiss is told, and what is sound is not": (
+        """
+        const { status, range } = state.view;
+        const none = { ...range, damaged: [], incomplete: [], unread: [], clock_faults: [] };
+        const fine = { ...status, doubts: SOUND, fell_silent: [], rules: [], never_heard: [],
+        missing: [] };
+        return [troublesOf(fine, none), troublesOf({ ...fine, never_heard: ['/scan'] }, none),
+        troublesOf(fine, range)].map((each) => each.length > 0)
+        """,
+        [False, True, True],
+    ),
     "sizes": (
         "return [0.000064, 0.002, 0.53, 12.345].map(size)",
         ["64 kB", "2 MB", "530 MB", "12.3 GB"],
@@ -528,21 +542,6 @@ def test_of_recordings_of_several_years_the_header_has_their_length_and_times_ha
         )
         assert times
         assert all(re.search(r", 20\d\d, ", each) for each in times)
-
-
-def test_nothing_green_stands_above_something_red(page: Browser) -> None:
-    """This history has a damaged file: its line comes first, and nothing is called sound."""
-    assert page.text("div#state").startswith("! Damaged bags")
-    assert page.run("return document.querySelectorAll('#state .good').length") == 0
-    sound = page.run(
-        "const { status, range } = state.view;"
-        "const none = { ...range, damaged: [], incomplete: [], unread: [], clock_faults: [] };"
-        "const fine = { ...status, doubts: SOUND, fell_silent: [], rules: [], never_heard: [],"
-        " missing: [] };"
-        "return [troublesOf(fine, none), troublesOf({ ...fine, never_heard: ['/scan'] }, none),"
-        " troublesOf(fine, range)].map((each) => each.length > 0)"
-    )
-    assert sound == [False, True, True]
 
 
 def test_ago_counts_from_one_moment_in_header_and_footer(page: Browser) -> None:

@@ -119,13 +119,12 @@ def publications(length_s: float, doubled: frozenset[int] = frozenset()) -> list
     return sorted(found, key=lambda each: each.at)
 
 
-def held(path: Path, reader: McapReader | BagDirReader) -> list[int]:
-    records = reader.records(path, TOPICS, TimeWindow.everything())
-    return [int(reader.decode(each).data) for each in records]  # type: ignore[attr-defined]
-
-
 def numbers(recording: Path, reader: McapReader | BagDirReader) -> Counter[int]:
-    return Counter(n for path in sorted(recording.glob("*.mcap")) for n in held(path, reader))
+    found = Counter[int]()
+    for path in recording.glob("*.mcap"):
+        records = reader.records(path, TOPICS, TimeWindow.everything())
+        found.update(int(reader.decode(each).data) for each in records)  # type: ignore[attr-defined]
+    return found
 
 
 def assert_union(bag_dir: Path) -> None:
