@@ -1,4 +1,4 @@
-"""How long was recorded after each recording, across restarts and full disks; and whose disk it is."""
+"""How long was recorded after each recording, across restarts and full disks; on which disk."""
 
 import errno
 import os
