@@ -23,11 +23,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import (
-    Robot,
-    publishing_robot,
-    wait_for,
-)
+from tests.support.ros_processes import Robot, publishing_robot, wait_for
 from tests.timing import each_in_time
 
 NOBODY = "65534"

@@ -34,10 +34,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import (
-    Robot,
-    publishing_robot,
-)
+from tests.support.ros_processes import Robot, publishing_robot
 from tests.support.served import Served
 from tests.timing import Watch, driven
 

@@ -123,11 +123,6 @@ def is_full(served: Served) -> bool:
     return bool(json.loads(served.get("/health")[1])["store"]["state"] == "ready")
 
 
-def moved_to(served: Served) -> list[str]:
-    """Where the store was moved to."""
-    return [each["path"] for each in served.events() if each["event"] == "database_moved"]
-
-
 def times_stored(served: Served) -> int:
     """How often a bag was stored, by the server or its helper."""
     return sum(each["bags"] for each in served.events() if each["event"] == "bags_stored")
@@ -149,7 +144,12 @@ def test_when_a_recorder_comes_the_store_goes_beside_the_bags_with_all_it_holds(
         known = numbered(cached)
         assert known
         recorded_before(strangers)
-        until(lambda: str(beside) in moved_to(served))
+
+        def is_moved() -> bool:
+            moves = [each for each in served.events() if each["event"] == "database_moved"]
+            return str(beside) in [each["path"] for each in moves]
+
+        until(is_moved)
         assert numbered(beside) == known
         assert times_stored(served) == len(known)
         anyio.run(asked_everything, served)

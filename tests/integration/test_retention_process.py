@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.state_files import LEAVING, Leaving
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Memory, QuerySettings
-from tests.integration.test_recorder_daemon import Site, sited
+from tests.integration.test_recorder_daemon import sited
 from tests.support.bags import McapLayout, mcap_content, odom, text, tf, transform, write_mcap
 from tests.support.examples import LONG
 from tests.support.heartbeats import beat
@@ -148,45 +148,45 @@ def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> No
     assert {path.parent for path in left} == {*bag_dir.glob("rec_*")}
 
 
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    with sited(tmp_path) as site:
-        yield site
-
-
 def age_held(bag_dir: Path) -> str | None:
     heartbeat = read_heartbeat(bag_dir).heartbeat
     assert heartbeat is not None
     return heartbeat.age_held
 
 
-def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(site: Site) -> None:
+def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(
+    tmp_path: Path,
+) -> None:
     """As the recorder finds it after a step of 150 h: its bags of a week look older than that."""
-    site.synchronised.write_text("no\n")
-    now = WallClock().now()
-    kept = [
-        write_mcap(
-            site.bag_dir / f"rec_20260101T{n:06}Z" / "0.mcap",
-            [odom(now - (149 + 2 * n) * 3600 * NS_PER_S + each, 1.0, 2.0) for each in range(20)],
-        )
-        for n in range(1, 20)
-    ]
-    daemon = site.run("retention.max_age_h=168", "retention.foreign=delete")
-    (held,) = daemon.wait_for("age_held")
-    assert held["bags"] == 10
-    until(lambda: age_held(site.bag_dir) == held["reason"])
-    with serving(site.bag_dir, site.folder / "server") as served:
-        assert answer(served, "memory_status")["notes"] == [held["reason"]]
-        assert json.loads(served.get("/health")[1])["recorder"]["age_held"] == held["reason"]
-    assert all(path.exists() for path in kept)
-    recorded = {path.name for path in daemon.recordings()} - {path.parent.name for path in kept}
-    assert max(recorded) in (site.bag_dir / ".episodic/recorded.jsonl").read_text()
+    with sited(tmp_path) as site:
+        site.synchronised.write_text("no\n")
+        now = WallClock().now()
+        kept = [
+            write_mcap(
+                site.bag_dir / f"rec_20260101T{n:06}Z" / "0.mcap",
+                [
+                    odom(now - (149 + 2 * n) * 3600 * NS_PER_S + each, 1.0, 2.0)
+                    for each in range(20)
+                ],
+            )
+            for n in range(1, 20)
+        ]
+        daemon = site.run("retention.max_age_h=168", "retention.foreign=delete")
+        (held,) = daemon.wait_for("age_held")
+        assert held["bags"] == 10
+        until(lambda: age_held(site.bag_dir) == held["reason"])
+        with serving(site.bag_dir, site.folder / "server") as served:
+            assert answer(served, "memory_status")["notes"] == [held["reason"]]
+            assert json.loads(served.get("/health")[1])["recorder"]["age_held"] == held["reason"]
+        assert all(path.exists() for path in kept)
+        recorded = {path.name for path in daemon.recordings()} - {path.parent.name for path in kept}
+        assert max(recorded) in (site.bag_dir / ".episodic/recorded.jsonl").read_text()
 
-    site.synchronised.write_text("yes\n")
-    daemon.wait_for("age_no_longer_held")
-    assert [path.exists() for path in kept] == [True] * 9 + [False] * 10
-    until(lambda: age_held(site.bag_dir) is None)
-    daemon.stop()
+        site.synchronised.write_text("yes\n")
+        daemon.wait_for("age_no_longer_held")
+        assert [path.exists() for path in kept] == [True] * 9 + [False] * 10
+        until(lambda: age_held(site.bag_dir) is None)
+        daemon.stop()
 
 
 @contextmanager

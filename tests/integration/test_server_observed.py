@@ -17,12 +17,7 @@ from mcp.client.streamable_http import streamable_http_client
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.processes import PATIENCE_S, http_server
 from tests.support.robot_run import ask
-from tests.support.served import (
-    Served,
-    command,
-    refusal,
-    serving,
-)
+from tests.support.served import Served, command, refusal, serving
 
 GOOD = "kJ7-x._~+/0123456789=="
 SHOWN = {"Authorization": f"Bearer {GOOD}"}

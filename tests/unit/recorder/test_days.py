@@ -939,9 +939,9 @@ class Bags(NamedTuple):
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> Bags:
-    """Splits of ten minutes of a day, of which two moments have two each; and the next morning."""
+    """Splits of eight minutes, of which two moments have two each; and the next morning."""
     folder = tmp_path_factory.mktemp("bags")
-    for nth in range(16, 26):
+    for nth in range(18, 26):
         split(folder, 60 * nth, labels=("mug", f"thing{nth}"))
     write_mcap(folder / "rec_B" / "rec_B_0.mcap", [odom(NEWEST + n * S, n, 1.0) for n in range(9)])
     own_all(folder)
@@ -966,7 +966,7 @@ def test_a_moment_answers_its_time_and_the_day_what_is_around_it(bags: Bags) -> 
         before, after = bags.ask(tool, **given)
         assert after == before
     # Across its edges nothing is counted twice, and nothing is missing.
-    before, after = bags.ask("recap", **window(17, 26))
+    before, after = bags.ask("recap", **window(18, 26))
     assert after["from"] == "memory"
     assert after["distance_m"] == pytest.approx(before["distance_m"], rel=0.01)
     for label in ("thing19", "thing20", "thing21", "thing22"):
@@ -978,7 +978,7 @@ def test_a_moment_answers_its_time_and_the_day_what_is_around_it(bags: Bags) -> 
 
 
 def test_nothing_can_be_saved_of_a_time_of_which_a_thinned_day_alone_is_left(bags: Bags) -> None:
-    assert "deleted" in str(saved(bags.keeper, bags.thinned, 1000, 1030).refused)
+    assert "deleted" in str(saved(bags.keeper, bags.thinned, 1090, 1120).refused)
 
 
 def test_a_moment_that_was_deleted_by_hand_leaves_no_memory_of_its_time(

@@ -24,17 +24,7 @@ from tests.support.examples import LONG
 from tests.support.fakes import broken
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.noting_reader import fail_reading
-from tests.support.screened_bags import (
-    T0,
-    S,
-    ScreenedBags,
-    mode,
-    off,
-    on,
-    privacy,
-    word,
-    words,
-)
+from tests.support.screened_bags import T0, S, ScreenedBags, mode, off, on, privacy, word, words
 from tests.support.simulated_recorders import events
 
 
