@@ -7,7 +7,8 @@ With T0 the clock's time (whole milliseconds) at the start and tick k at t = k /
   header stamps are T0 + t exactly.
 - `/tf_static` once, latched: laser and camera in base_link.
 - `/cmd_vel` (geometry_msgs/Twist) every second tick.
-- `/bumper` (std_msgs/Bool) twice a second, true while 25 <= t < 26.
+- `/bumper` (std_msgs/Bool) twice a second, true while 25 <= t < 26; told by SIGUSR1, for the
+  second that begins with its next message instead.
 - `/battery_state` (sensor_msgs/BatteryState) once a second: percentage 0.8 - 0.001 t.
 - `/vision/scene/scene_objects` (ros2_vision_interfaces/VisionDetectionArray) once a second:
   "table" always, "cup" for 5 <= t < 30, "scissors" for 12 <= t < 18.
@@ -104,8 +105,9 @@ def is_due(topic: str, tick: int, hz: float) -> bool:
 class Messages:
     """The messages of one robot, serialized."""
 
-    def __init__(self, t0: int) -> None:
+    def __init__(self, t0: int, bumps_s: float = math.inf) -> None:
         self._t0 = t0
+        self.bumps_s = bumps_s
 
     def payload(self, topic: str, t: float) -> bytes:
         """The message published on `topic` t seconds after T0, as CDR."""
@@ -117,7 +119,7 @@ class Messages:
                 at, *(transform(at, "base_link", name, place) for name, place in _SENSORS.items())
             ),
             "/cmd_vel": lambda: command(at, RADIUS * TURN_RATE, TURN_RATE),
-            "/bumper": lambda: boolean(at, 25.0 <= t < 26.0),
+            "/bumper": lambda: boolean(at, 0.0 <= t - self.bumps_s < 1.0),
             "/battery_state": lambda: battery(at, 0.8 - 0.001 * t),
             "/vision/scene/scene_objects": lambda: detections(at, seen(t)),
             "/speech": lambda: text(at, f"what people say at {t:.0f} s"),
@@ -154,6 +156,7 @@ class Robot:
         self._node = rclpy.create_node("robot", enable_rosout=False, start_parameter_services=False)
         self._truth = truth
         self._stop = False
+        self._bump = False
         self._matched = [(0, 0)]
         self._late_s = 0.0
         self._publishers = {}
@@ -170,20 +173,23 @@ class Robot:
     def stop(self, *_: object) -> None:
         self._stop = True
 
+    def bump(self, *_: object) -> None:
+        self._bump = True
+
     def await_subscribers(self, count: int) -> None:
         """Returns when every topic but the latched one has so many, or at a signal."""
         waiting = [p for topic, p in self._publishers.items() if topic != "/tf_static"]
         while not self._stop and any(p.get_subscription_count() < count for p in waiting):
             time.sleep(0.02)
 
-    def drive(self, hz: float) -> None:
+    def drive(self, hz: float, bumps_s: float) -> None:
         """Publishes until a signal, and leaves."""
         for topic in self._publishers:
             # The first of its type is slow to make.
             Messages(0).payload(topic, 0.0)
         t0 = time.time_ns() // 10**6 * 10**6
         begin = time.monotonic()
-        messages, published = Messages(t0), Counter[str]()
+        messages, published = Messages(t0, bumps_s), Counter[str]()
         self._tell(t0, published, 0)
         tick = 0
         first = next(iter(self._publishers.values()))
@@ -192,6 +198,9 @@ class Robot:
             if first.get_subscription_count() != self._matched[-1][1]:
                 self._matched.append((time.time_ns(), first.get_subscription_count()))
                 self._tell(t0, published, tick)
+            if self._bump:
+                self._bump = False
+                messages.bumps_s = math.ceil(tick / hz * 2) / 2
             for topic, out in self._publishers.items():
                 if is_due(topic, tick, hz):
                     out.publish(messages.payload(topic, tick / hz))
@@ -219,6 +228,7 @@ class Robot:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bump", type=float, default=25.0, help="when it does untold; s")
     parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
     default = [topic for topic in TYPES if topic not in UNASKED]
     parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
@@ -229,8 +239,9 @@ def main() -> None:
     robot = Robot(given.topics, given.truth)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, robot.stop)
+    signal.signal(signal.SIGUSR1, robot.bump)
     robot.await_subscribers(given.subscribers)
-    robot.drive(given.hz)
+    robot.drive(given.hz, given.bump)
     rclpy.shutdown()
 
 

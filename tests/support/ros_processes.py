@@ -85,6 +85,10 @@ class Robot:
         assert code == 0, f"the robot's publishers ended with {code}"
         return {str(topic): int(count) for topic, count in self._truth()["published"].items()}
 
+    def bump(self) -> None:
+        """It bumps into something, now instead of at its own time."""
+        self.process.send_signal(signal.SIGUSR1)
+
     def _truth(self) -> dict[str, Any]:
         truth: dict[str, Any] = json.loads(self.truth_file.read_text())
         return truth
