@@ -703,10 +703,7 @@ def load_explained(
     """
     given = given_variables(os.environ if env is None else env)
     folder, beside = config_dir(given), _working_dir() / "config"
-    appended = {}
-    if INTERFACES_VARIABLE in given:
-        appended["reader.custom_msg_paths"] = INTERFACES_VARIABLE
-    sources = Sources(folder, parse_overrides(overrides, given, folder), appended)
+    sources = Sources(folder, parse_overrides(overrides, given, folder))
     with foreign_errors_as_config_error(str(folder), sources):
         with initialize_config_dir(version_base="1.3", config_dir=str(folder)):
             composed = compose(

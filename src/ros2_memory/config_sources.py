@@ -1,7 +1,7 @@
 """Where the values of the configuration come from: variables, overrides, and files.
 
 Variables and overrides become assignments in Hydra's grammar. `Sources` tells which assignment, or
-which file of the configuration directory, set a key.
+which files of the configuration directory, set a key.
 """
 
 from __future__ import annotations
@@ -10,25 +10,19 @@ import re
 import shlex
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import yaml
-from hydra import initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType, Quote, QuotedString
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from yaml import YAMLError
 
 from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-    from hydra._internal.defaults_list import DefaultsList  # Hydra has no public name for it
 
 GROUPS: Final = ("deployment", "storage", "recorder", "lake")
 """The config groups: folders with options, of which one is chosen."""
@@ -59,51 +53,34 @@ class Sources:
     Attributes:
         folder: the configuration directory.
         overrides: the assignments of variables and overrides; later wins.
-        appended: the variables that append to the value of a key, by key.
     """
 
     folder: Path
     overrides: Sequence[Override]
-    appended: Mapping[str, str]
 
     def __call__(self, key: str) -> str:
-        """Returns who set a key."""
+        """Returns who set a key: an assignment, or the files that have the key."""
         for override in reversed(self.overrides):
             path, override_path = f"{key}.", f"{override.key}."
             is_related = path.startswith(override_path) or override_path.startswith(path)
             if override.key not in GROUPS and is_related:
                 return override.source
-        variable = self.appended.get(key)
-        return f"{self._file_of(key)}{f', and by {variable}' if variable else ''}"
+        files = [str(path) for path in sorted(self.folder.rglob("*.yaml")) if self._sets(path, key)]
+        return f"in {' or '.join(files) or self.folder}"
 
-    def choice(self, group: str) -> tuple[str | None, str]:
-        """Returns the option of a group, and who chose it."""
-        composed = self._composed.overrides if self._composed else None
-        option = composed.known_choices.get(group) if composed else None
-        for override in reversed(self.overrides):
-            if override.key == group:
-                return option, override.source
-        chosen = composed.override_metadata.get(group) if composed else None
-        file = chosen.containing_config_path if chosen else "config"
-        return option, f"in {self.folder / f'{file}.yaml'}"
-
-    def _file_of(self, key: str) -> str:
-        for default in reversed(self._composed.defaults if self._composed else ()):
-            path = self.folder / f"{default.config_path}.yaml"
-            if _sets(path, default.package or "", key):
-                return f"in {path}"
-        return f"in {self.folder}"
-
-    @cached_property
-    def _composed(self) -> DefaultsList | None:
-        """The files that Hydra composes, later wins; None if it cannot compose them."""
-        folder = initialize_config_dir(version_base="1.3", config_dir=str(self.folder))
-        texts = [override.text for override in self.overrides]
-        with suppress(HydraException, YAMLError, ValueError, RecursionError), folder:
-            loader = GlobalHydra.instance().config_loader()
-            composed: DefaultsList = loader.compute_defaults_list("config", texts, RunMode.RUN)
-            return composed
-        return None
+    def _sets(self, path: Path, key: str) -> bool:
+        try:
+            content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, YAMLError, RecursionError):
+            return False
+        group = path.parent.name
+        if path.parent != self.folder and group != "deployment":
+            content = {group: content}
+        for name in key.split("."):
+            if not isinstance(content, dict) or name not in content:
+                return False
+            content = content[name]
+        return True
 
 
 def quoted(value: str) -> str:
@@ -246,17 +223,3 @@ def _parse_override(text: str, source: str, options: Mapping[str, Sequence[str]]
             f"(set {source})"
         )
     return Override(key, text, source)
-
-
-def _sets(path: Path, section: str, key: str) -> bool:
-    """Returns whether a file sets a key; all keys of the file are in `section`, if not empty."""
-    try:
-        content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, YAMLError, RecursionError):
-        return False
-    content = {section: content} if section else content
-    for part in key.split("."):
-        if not isinstance(content, dict) or part not in content:
-            return False
-        content = content[part]
-    return True

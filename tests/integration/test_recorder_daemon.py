@@ -326,11 +326,11 @@ def test_a_bag_directory_that_cannot_be_made_or_that_ros2_cannot_take_is_named(s
 
 
 def test_ctrl_c_while_it_reads_its_configuration_is_an_interruption() -> None:
-    with patch("ros2_memory.recorder.__main__.load_explained", side_effect=KeyboardInterrupt):
+    with patch("ros2_memory.recorder.__main__.load_settings", side_effect=KeyboardInterrupt):
         assert main([]) == 130
 
 
-def test_recorder_none_says_what_set_it_touches_nothing_and_is_no_failure(site: Site) -> None:
+def test_recorder_none_touches_nothing_and_is_no_failure(site: Site) -> None:
     site.old_bag()
     site.bag_dir.chmod(0o555)
     address = site.folder / "notify"
@@ -345,7 +345,6 @@ def test_recorder_none_says_what_set_it_touches_nothing_and_is_no_failure(site: 
         # An exit with 0 before it is ready would be a failure that is tried again for ever.
         assert (code, manager.recv(100)) == (0, b"READY=1")
     assert "recorder=none" in message
-    assert "set by MEMORY_CONFIG_OVERRIDES" in message
     assert "such as robot" not in message
     assert {path: path.stat().st_mtime_ns for path in site.folder.rglob("*")} == before
 

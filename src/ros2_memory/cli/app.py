@@ -115,8 +115,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     "up": CommandEntry(
         "up.up",
         "on a robot: propose what to record, and record and serve it",
-        "the recorder or the server ended by itself (stderr has its last error), or you "
-        "answered no",
+        "the recorder or the server ended by itself, or you answered no",
     ),
     "index": CommandEntry(
         "maintenance.index.index",

@@ -27,7 +27,7 @@ from ros2_memory.cli.options import (
     present_time,
     with_date,
 )
-from ros2_memory.cli.output import cut_lists, print_json, print_line, print_reply, spinner
+from ros2_memory.cli.output import print_json, print_line, print_reply, spinner
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -99,7 +99,7 @@ def ask(
             looking.append(word)
         else:
             question.append(word)
-    loaded, _ = load_to_look(bag_dir, looking, recording)
+    loaded = load_to_look(bag_dir, looking, recording)
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, allows_fleet=True)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
@@ -123,9 +123,7 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        if isinstance(answer, dict):
-            answer = cut_lists(answer, ["waypoints"])
-        print_reply(answer, unix_from_ns(present_time(memory)))
+        print_reply(answer)
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 

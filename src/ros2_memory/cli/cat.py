@@ -18,9 +18,9 @@ from ros2_memory.cli.output import (
     print_notes,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.no_data import resolve_topic
@@ -87,17 +87,9 @@ def cat(
     note_unread(view, window)
     print_notes(view.notes.sentences())
     if not count:
-        print(_describe_nothing(name, window), file=sys.stderr)
+        advice = "`ros2-memory topics` says when there are some"
+        print(f"no message of {name} in this time; {advice}", file=sys.stderr)
     return not count or not view.notes.complete
-
-
-def _describe_nothing(topic: str, window: TimeWindow) -> str:
-    first, last = (format_time(unix_from_ns(at)) for at in window.asked())
-    since = f" from {first}" if window.start > MIN_NS else ""
-    until = f" until {last}" if window.stop < MAX_NS else ""
-    when = f"{since}{until}" or " at any time"
-    advice = "`ros2-memory topics` says when there are some"
-    return f"no message of {topic} to show{when}; {advice}"
 
 
 def extract_values(

@@ -14,29 +14,18 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
-from rich.text import Text
-
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import (
-    ERASING_FILE,
-    MOMENTS_FOLDER,
-    OWN_FOLDER,
-    SHIPPED_FILE,
-    has_recorded,
-    is_carried,
-)
-from ros2_memory.bag_dir.state_files import describe_leaving, is_shipped, read_receipts
+from ros2_memory.bag_dir.layout import ERASING_FILE
+from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
-from ros2_memory.cli.info import describe_budget
 from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reason_of
-from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
-from ros2_memory.columns.store import relative
+from ros2_memory.cli.output import escape, format_size, print_json, print_line, spinner
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
-from ros2_memory.core.model import BagFile, BagState, SetAside
+from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
-from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.no_data import nothing_here
@@ -68,8 +57,6 @@ _WAIT: Final = (
 )
 _CORRECT: Final = "correct the key that it names"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
-_LATE_NS: Final[Ns] = NS_PER_HOUR
-"""A hub that is reached has confirmed closed bags after this time."""
 
 
 class Examined(NamedTuple):
@@ -115,7 +102,6 @@ class Finding(NamedTuple):
     do: str | None = None
 
 
-_STYLES: Final = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
 ok: Final = partial(Finding, Level.OK, "")
 warning: Final = partial(Finding, Level.WARNING, "")
 error: Final = partial(Finding, Level.ERROR, "")
@@ -132,13 +118,10 @@ def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
         rows = [{**finding._asdict(), "level": str(finding.level)} for finding in findings]
         print_json({"status": str(worst), "findings": rows})
         return worst
-    console = stdout_console()
     for finding in findings:
-        level = f"{finding.level!s:<8}", _STYLES[finding.level]
-        about = f"{finding.about:<9}", "bold"
-        console.print(Text.assemble(level, about, escape(finding.seen)), soft_wrap=True)
+        print_line(f"{finding.level!s:<8}{finding.about:<9}{escape(finding.seen)}")
         if finding.do:
-            console.print(Text(f"{'':17}-> {escape(finding.do)}"), soft_wrap=True)
+            print_line(f"{'':17}-> {escape(finding.do)}")
     return worst
 
 
@@ -235,11 +218,13 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
         return
     bag_dir, limits = robot.settings.recording.bag_dir.absolute(), robot.settings.retention
     existing = next(path for path in (bag_dir, *bag_dir.parents) if path.is_dir())
-    mount = next(path for path in (existing, *existing.parents) if os.path.ismount(path))
     free_gb = shutil.disk_usage(existing).free / GB
     budget = budget_of(robot.memory, robot.snapshot, robot.memory.index.heartbeat(), robot.now)
     room_gb = free_gb - limits.min_free_gb + budget.used / GB
-    seen = f"{free_gb:.1f} GB free on {mount}; used: {describe_budget(budget)}"
+    seen = f"{free_gb:.1f} GB free in {existing}; used: {format_size(budget.used)} of "
+    seen += f"{limits.max_total_gb:g} GB (retention.max_total_gb)"
+    if budget.foreign:
+        seen += f"; {format_size(budget.foreign)} more by bags that `ros2-memory adopt` would count"
     if free_gb < limits.min_free_gb:
         limit = f"retention.min_free_gb={limits.min_free_gb:g}"
         yield error(seen, f"recording pauses below {limit}; delete other files on this disk")
@@ -357,9 +342,7 @@ def check_columns(robot: Examined) -> Iterator[Finding]:
         bags = counted(store.refusals, "bag")
         yield warning(f"{bags} could not be stored ({store.refused_for})", do)
     if dropped := store.dropped():
-        since = iso_local(min(dropped.values()))
-        seen = f"topics beyond store.max_share since {since}, whose bags are read: "
-        yield ok(f"{seen}{', '.join(dropped)}")
+        yield ok(f"topics beyond store.max_share, whose bags are read: {', '.join(dropped)}")
 
 
 def check_recorder(robot: Examined) -> Iterator[Finding]:
@@ -448,38 +431,8 @@ def _check_last_error_of(heartbeat: Heartbeat) -> Iterator[Finding]:
         yield warning(seen, "see its log")
 
 
-def check_shipping(robot: Examined) -> Iterator[Finding]:
-    """Checks that bags are shipped, if age deletes only shipped ones (`require_shipped`)."""
-    if not robot.settings.retention.require_shipped:
-        return
-    bag_dir = robot.settings.recording.bag_dir
-    receipts = read_receipts(bag_dir)
-    closed: list[BagFile] = []
-    waiting: list[BagFile] = []
-    for bag in robot.snapshot.bags:
-        name = relative(bag.file, str(bag_dir))
-        is_moment = name.startswith(f"{MOMENTS_FOLDER}/")
-        if bag.state is not BagState.CLOSED or is_carried(bag.path) or is_moment:
-            continue
-        closed.append(bag)
-        if not is_shipped(receipts, name, bag.size):
-            waiting.append(bag)
-    newest = max((receipt.at for receipt in receipts.values()), default=None)
-    seen = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
-    if newest is None:
-        seen += ", and there is no receipt: no bag is deleted for its age"
-    else:
-        seen += f"; the newest receipt is from {iso_local(newest)}"
-    late = robot.now - _LATE_NS
-    if any(bag.end < late for bag in waiting) and (newest or 0) < late:
-        do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
-        yield warning(seen, do)
-    else:
-        yield ok(seen)
-
-
 def check_lake(settings: Settings) -> Iterator[Finding]:
-    """Checks that the lake is reached, and that receipts can be written on the robots."""
+    """Checks that the lake is reached."""
     if settings.lake.warehouse is None:
         return
     try:
@@ -494,18 +447,6 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
         yield ok(f"{location.warehouse}; its bags last changed {iso_local(changed)}")
-    if settings.lake.engine is not None:  # this server only asks the lake
-        return
-    for name, bag_dir in settings.fleet.robots.items():
-        candidates = bag_dir / SHIPPED_FILE, bag_dir / OWN_FOLDER, bag_dir
-        path = next((path for path in candidates if path.exists()), bag_dir)
-        if has_recorded(bag_dir) and not os.access(path, os.W_OK):
-            seen = (
-                f"{name}: {path} is read-only here: no receipts can be written, so "
-                "retention.require_shipped can never work on that robot"
-            )
-            do = "mount it writable for the user of ros2-memory ship, or do not require it"
-            yield Finding(Level.WARNING, "robot", seen, do)
 
 
 def check_ros(robot: Examined) -> Iterator[Finding]:
@@ -619,7 +560,6 @@ _OF_BAGS: Final = {
 _OF_RECORDER: Final = {
     "ros": check_ros,
     "recorder": check_recorder,
-    "shipping": check_shipping,
     "topics": check_topics,
 }
 _OF_SETTINGS: Final = {"server": check_server}

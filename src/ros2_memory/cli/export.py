@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -44,11 +44,10 @@ def export(
     ] = None,
     times: Times,
     latched: Annotated[
-        bool | None,
+        bool,
         "--latched/--no-latched",
-        "Also copy the latched messages valid at the start: maps, static transforms "
-        "(default: for --mcap).",
-    ] = None,
+        "Also copy to MCAP the latched messages valid at the start: maps, static transforms.",
+    ] = True,
     robot: Annotated[
         str | None, "NAME", "Partition Parquet by robot, too: one dataset for a fleet."
     ] = None,
@@ -67,20 +66,15 @@ def export(
     window = times.window(memory)
     topics = _matching_topics(view, topic or ())
     note_unread(view, window)
-    with_latched = mcap is not None if latched is None else latched
-    earlier = _latched_before(view, topics, window.start) if with_latched else []
-    within = view.stream.messages(topics, window)
-    first = [*islice(within, 1)]
-    if latched is None and not first and not view.timeline.overlapping(window):
-        earlier = []  # alone they would look like an answer
+    earlier: list[StoredMessage] = []
+    # Where nothing is recorded, they alone would look like an answer.
+    if mcap is not None and latched and view.timeline.overlapping(window):
+        earlier = _latched_before(view, topics, window.start)
     if earlier:
         copied = counted(len(earlier), "latched message is", "latched messages are")
         begins = f"the file begins at {unix_text(earlier[0].time)}"
-        none = "" if first else "; no message is in the window"
-        view.notes.add(
-            f"{copied} copied from before the window, with the original time: {begins}{none}"
-        )
-    messages = chain(earlier, first, within)
+        view.notes.add(f"{copied} copied from before the window, with the original time: {begins}")
+    messages = chain(earlier, view.stream.messages(topics, window))
     with spinner("exporting"):
         if mcap is not None:
             definitions = Definitions(memory.reader)

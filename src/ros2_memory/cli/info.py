@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -12,33 +11,23 @@ from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_once
 from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
 from ros2_memory.cli.output import (
-    cut_lists,
-    format_size,
-    format_value,
+    leaves,
     print_json,
     print_line,
     print_notes,
     print_reply,
-    stdout_console,
 )
 from ros2_memory.config import Settings
 from ros2_memory.core.model import BagFile
 from ros2_memory.core.reply import JsonObject, Scope, shown
-from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.no_data import nothing_here
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import budget_of, usual_rate
+from ros2_memory.insights.status import usual_rate
 from ros2_memory.queries import list_recorded_topics
-from ros2_memory.results import Budget, TopicRow
-
-_TOLD_TWICE: Final = frozenset(
-    {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics", "budget"}
-)
-_MOST_SILENT: Final = 30
-_OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
+from ros2_memory.results import TopicRow
 
 
 def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
@@ -94,7 +83,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
         reports[name] = report = _report(own, memory)
         has_bags = has_bags or bool(memory.index.snapshot().bags)
         if robots and not as_json:
-            stdout_console().rule(name, align="left")
+            print_line(f"\n{name}")
         if not as_json:
             _print_report(memory, report)
     if as_json:
@@ -111,27 +100,14 @@ def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
 
 
 def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
-    """Prints a report for people, without keys that are empty or say what another says."""
+    """Prints the values of a report that are known."""
     snapshot = memory.index.snapshot()
     files = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any(files):
         _print_nothing(memory)
         return
-    values: JsonObject = {}
-    for part in report.values():
-        values |= part
-    left_out = _TOLD_TWICE if values["recorder"] is not None else _TOLD_TWICE | _OF_RECORDER
-    for key, value in [*values.items()]:
-        is_empty = value in ([], 0) and key != "earliest"  # a clock may begin at 0
-        if key in left_out or is_empty:
-            del values[key]
-    budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
-    if budget.most is not None:  # bags of other programs have no budget
-        values["budget"] = describe_budget(budget)
-    if snapshot.silent_topics:
-        topics = sorted(snapshot.silent_topics)
-        values["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
-    print_reply(cut_lists(values, values))
+    values = {key: value for part in report.values() for key, value in leaves(part)}
+    print_reply({key: value for key, value in values.items() if value not in (None, [])})
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
@@ -160,31 +136,6 @@ def storage_of(bags: Sequence[BagFile]) -> str:
     return ", ".join(sorted(kind.removeprefix(".") for kind in kinds))
 
 
-def describe_budget(budget: Budget) -> str:
-    """Returns how much of the budget is used, by what, and how many days it lasts."""
-    text = (
-        f"{format_size(budget.used)} of {format_size(budget.most or 0)}: "
-        f"bags {format_size(max(budget.used - budget.state, 0))}, "
-        f"what is stored beside them {format_size(budget.state)}"
-    )
-    if budget.foreign:
-        text += (
-            f"; bags that the recorder did not make take {format_size(budget.foreign)} more, and "
-            "are neither counted nor deleted: `ros2-memory adopt DIR` takes those of a folder"
-        )
-    if budget.per_day is not None:
-        text += f"; grows by {format_size(budget.per_day)} a day"
-    if budget.full_in_days is not None and budget.keeps_days is not None:
-        text += f"; full in {_days(budget.full_in_days)} at this rate"
-        text += f"; bags older than {_days(budget.keeps_days)} are deleted"
-    return text
-
-
-def _days(value: float) -> str:
-    days = round(value, 0 if value >= 10 else 1)
-    return f"{format_value(days)} {'day' if days == 1 else 'days'}"
-
-
 def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     """List every recording of a folder: start, length, size, and which program made it.
 
@@ -200,8 +151,6 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif is_empty:
         _print_nothing(memory)
     else:
-        for row in rows:
-            del row["end"]  # people see the length
         lists: JsonObject = {"recordings": [*rows], "not_read": [*not_read]}
         print_reply({title: entries for title, entries in lists.items() if entries})
     return is_empty

@@ -22,13 +22,13 @@ import typer
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
-from ros2_memory.cli.output import print_json, spinner, with_local_times
-from ros2_memory.config import NullRecorderNode, Settings, is_deployment_chosen, load_explained
-from ros2_memory.config_sources import GROUPS, Sources, quoted
+from ros2_memory.cli.output import escape, print_json, spinner
+from ros2_memory.config import NullRecorderNode, Settings, is_deployment_chosen, load_settings
+from ros2_memory.config_sources import GROUPS, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
-from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
+from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.model import BAG_KINDS, TimeWindow
-from ros2_memory.core.text import counted, listed, similar
+from ros2_memory.core.text import listed, similar
 from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
@@ -63,8 +63,7 @@ _AGO: Final = re.compile(
 )
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _LARGEST_UNIX_S: Final = 1e11
-_LARGEST_UNIX_MS: Final = 1e15
-"""A larger number than the first is in milliseconds, than the second in nanoseconds."""
+"""A larger number is in milliseconds or nanoseconds."""
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
@@ -116,8 +115,8 @@ Last = Annotated[
 ]
 
 
-def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> tuple[Settings, Sources]:
-    """Loads the configuration as the server does, and who set each key.
+def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
+    """Loads the configuration as the server does.
 
     `bag_dir` wins over `recording.bag_dir`. It is the directory of one robot, so no fleet is
     configured then.
@@ -127,13 +126,13 @@ def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> tuple[Set
     """
     words = [*(overrides or ())]
     if bag_dir is None:
-        return load_explained(words)
+        return load_settings(words)
     words.append(f"recording.bag_dir={quoted(str(bag_dir.absolute()))}")
-    settings, sources = load_explained(words)
-    return replace(settings, fleet=replace(settings.fleet, robots={}, tokens={})), sources
+    settings = load_settings(words)
+    return replace(settings, fleet=replace(settings.fleet, robots={}, tokens={}))
 
 
-def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> tuple[Settings, Sources]:
+def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
     """Loads the configuration by `load_to_look` if a word is a path, else by `load_for`."""
     if any(map(_is_path, words or ())):
         return load_to_look(bag_dir, words)
@@ -142,7 +141,7 @@ def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> tuple[Setti
 
 def load_to_look(
     bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
-) -> tuple[Settings, Sources]:
+) -> Settings:
     """Loads the configuration for a command that only reads bags; a PATH among its words wins.
 
     Bags that this deployment does not record are read with the settings `LOOKING`, unless the words
@@ -153,13 +152,13 @@ def load_to_look(
         InvalidArgumentsError: a PATH does not exist, or two are given.
     """
     named, settings_words = settings_to_look(bag_dir, words, recording)
-    settings, sources = load_for(named, settings_words)
+    settings = load_for(named, settings_words)
     folder = settings.recording.bag_dir
     if named is None and not is_deployment_chosen(settings_words) and not has_recorded(folder):
         has_bags = folder.is_dir() and next(folders_with_bags(folder), None) is not None
         if has_bags:
             return load_for(None, [*LOOKING, *settings_words])
-    return settings, sources
+    return settings
 
 
 def settings_to_look(
@@ -193,7 +192,7 @@ def settings_to_look(
     if bag_dir is not None and not _is_recorded_now(bag_dir):
         is_chosen = is_deployment_chosen(settings)
         if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in settings):
-            deployed, _ = load_for(None, settings)
+            deployed = load_for(None, settings)
             is_chosen = bag_dir.absolute() == deployed.recording.bag_dir.absolute()
         if not is_chosen:
             settings = [*LOOKING, *settings]
@@ -269,8 +268,7 @@ def open_memory(
 
     Args:
         settings: the configuration.
-        verbose: whether log events are shown on stderr. Otherwise warnings are counted, and
-            `reported_errors` prints the count when the command ends.
+        verbose: whether log events are shown on stderr; otherwise errors alone.
         allows_fleet: whether the command also asks the robots of a fleet, whose memory has no bags
             of its own, and no index.
         setting: the setting that names the bags, if it is not `recording.bag_dir`.
@@ -289,9 +287,7 @@ def open_memory(
     # Imported here: `adopt`, `recover` and `config show` do without the libraries that answer.
     from ros2_memory.bootstrap import build_memory, shared_parts  # noqa: PLC0415
 
-    configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
-    if not verbose:
-        withhold_warnings()
+    configure_logging(settings.logging.level if verbose else "error", settings.logging.format)
     memory = build_memory(settings, shared_parts(settings), setting=setting)
     if robots:
         return memory
@@ -361,10 +357,7 @@ def parse_time(text: str, now: float) -> float:
     except ValueError as error:
         raise InvalidArgumentsError(f"{text} {error}") from None
     if abs(number) > _LARGEST_UNIX_S:
-        seconds = number / (1e3 if abs(number) <= _LARGEST_UNIX_MS else 1e9)
-        raise InvalidArgumentsError(
-            f"{text} is too large for Unix seconds; in seconds it is {seconds:.3f}"
-        )
+        raise InvalidArgumentsError(f"{text} is too large for Unix seconds")
     return number
 
 
@@ -404,7 +397,7 @@ class Bags:
 
     def settings(self, *more: str) -> Settings:
         """Loads the configuration as `load_to_look` does; `more` are further settings."""
-        return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)[0]
+        return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)
 
     def memory(self, *more: str) -> "Memory":
         """Opens the memory of these bags as `open_memory` does; `more` are further settings."""
@@ -514,10 +507,7 @@ def reason_of(error: Exception) -> str:
 
 @contextmanager
 def reported_errors(command: str) -> Iterator[None]:
-    """Prints an error of the block as one line on stderr, and exits with code 2.
-
-    Then prints how many warnings were logged without being shown.
-    """
+    """Prints an error of the block on stderr, and exits with code 2."""
     try:
         yield
     except BrokenPipeError:
@@ -525,17 +515,9 @@ def reported_errors(command: str) -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(EXIT_NEGATIVE) from None
     except (EpisodicError, OSError) as error:
-        lines = "\n".join(map(with_local_times, reason_of(error).split("\n")))
+        lines = "\n".join(map(escape, reason_of(error).split("\n")))
         print(f"ros2-memory {command}: {lines}", file=sys.stderr)
         raise typer.Exit(EXIT_CANNOT_RUN) from None
-    finally:
-        if events := withheld_warnings():
-            names = listed([event if n == 1 else f"{n} x {event}" for event, n in events.items()])
-            advice = "" if command == "doctor" else ", `ros2-memory doctor` says what to do"
-            logged = counted(events.total(), "warning")
-            print(
-                f"ros2-memory: {logged} logged ({names}); -v shows the log{advice}", file=sys.stderr
-            )
 
 
 @contextmanager

@@ -7,7 +7,7 @@ matplotlib keeps in its own folders, its list of fonts.
 import logging
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,20 +22,12 @@ from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.cat import extract_values
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, newest_day
-from ros2_memory.cli.output import (
-    atomic_file,
-    leaves,
-    print_json,
-    print_line,
-    print_notes,
-    spinner,
-)
+from ros2_memory.cli.output import atomic_file, print_json, print_line, print_notes, spinner
 from ros2_memory.core.arrays import Ints
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
-from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Place
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united, without
-from ros2_memory.core.text import counted, listed, shortened
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import recording_gaps
@@ -48,40 +40,30 @@ from ros2_memory.serving.page.drawn_path import Box, Line, line_in_box
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 
-FORMATS: Final = (".svg", ".png", ".pdf")
+FORMATS: Final = (".svg", ".png")
 _EVERYWHERE: Final = Box(-math.inf, -math.inf, math.inf, math.inf, 0.001)
 """The path is drawn to the millimetre."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
-_MOST_SIGNALS: Final = 6
-_MOST_TOPICS: Final = 30
 _PERIODS: Final = 5
 """A step of a signal that is longer than so many usual ones, and than a second, is a gap."""
-_FEWEST_WITHOUT_MARKERS: Final = 60
-"""Of a signal with fewer samples each one is marked."""
 _STYLE: Final = {
     "axes.axisbelow": True,
     "axes.grid": True,
-    "axes.titlelocation": "left",
-    "figure.titlesize": 11,
     "font.size": 9,
     "svg.hashsalt": "ros2-memory",
     "text.parse_math": False,  # or a dollar sign in a name would begin a formula
 }
 _DAY_S: Final = 86_400
-_LEAST_SHARE: Final = 0.002
-"""Of the width of a timeline: shorter stretches are drawn so long, to be seen."""
-_LONGEST_NAME: Final = 34
 
 Seconds: TypeAlias = tuple[float, float]
 Floats: TypeAlias = NDArray[np.float64]
 Signal: TypeAlias = tuple[Floats, Floats]
 """Times (Unix s) and values; a value is NaN where the message has none, and in gaps."""
-Rows: TypeAlias = dict[str, Sequence[Seconds]]
+Rows: TypeAlias = Mapping[str, Sequence[Seconds]]
 """The rows of a timeline by name: the first and the last time of each stretch."""
 
 plot = typer.Typer(
@@ -102,26 +84,9 @@ class PlotWindow(NamedTuple):
         """The first and the last time of the window (Unix s, inclusive)."""
         return _in_seconds((self.window.start, self.window.stop - 1))
 
-    @property
-    def title(self) -> str:
-        """The first and the last time of the window, as text in this machine's zone."""
-        start, end = (datetime.fromtimestamp(at).astimezone() for at in self.span)
-        return f"{start:%Y-%m-%d %H:%M:%S} - {end:%Y-%m-%d %H:%M:%S %Z}"
-
     def recap(self) -> Recap:
         """Returns the recap of the window."""
         return recap(self.view.memory, Call(), TimeRange.over(self.window))
-
-    def path(self) -> tuple[str, Line]:
-        """Returns the frame of the robot's path, and the path, which has at least one point.
-
-        Raises:
-            NoDataError: nothing places the robot in this time.
-        """
-        path, line, _ = line_in_box(self.view.memory, Call(), self.window, _EVERYWHERE)
-        if not len(line.times):
-            raise NoDataError(NoDataReason.OUTSIDE_RANGE, "the robot has no place in this time")
-        return path.frame, line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,11 +94,7 @@ class Picture(Bags, Times):
     """The options of a picture."""
 
     out: Annotated[
-        Path,
-        "--out",
-        "-o",
-        "FILE",
-        "Write the picture here: .svg, .png or .pdf; overwrites the file.",
+        Path, "--out", "-o", "FILE", "Write the picture here: .svg or .png; overwrites the file."
     ]
     as_json: AsJson = False
 
@@ -159,10 +120,12 @@ class Picture(Bags, Times):
         return recorded_part(memory, self.window(memory))
 
     @contextmanager
-    def figure(self, title: str, size: Seconds, notes: Sequence[str]) -> Iterator["Figure"]:
+    def figure(
+        self, title: str, shown: PlotWindow, notes: Sequence[str], height: float = 6.0
+    ) -> Iterator["Figure"]:
         """Yields a figure to draw on; afterwards writes the file, and prints its name and notes.
 
-        `size` is the width and the height of the figure in inches.
+        `height` is in inches.
 
         Raises:
             OSError: the file cannot be written.
@@ -172,11 +135,12 @@ class Picture(Bags, Times):
         from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
         from matplotlib.figure import Figure  # noqa: PLC0415
 
+        start, end = (datetime.fromtimestamp(at).astimezone() for at in shown.span)
         kind = self.out.suffix[1:].lower()
         with rc_context(_STYLE), warnings.catch_warnings(), atomic_file(self.out) as temporary:
             warnings.simplefilter("ignore")  # about letters that no font here has
-            figure = Figure(figsize=size, layout="constrained")
-            figure.suptitle(title, x=0.01, ha="left")
+            figure = Figure(figsize=(9.0, height), layout="constrained")
+            figure.suptitle(f"{title}, {start:%Y-%m-%d %H:%M:%S} - {end:%Y-%m-%d %H:%M:%S %Z}")
             yield figure
             metadata = {"Date": None} if kind == "svg" else None
             figure.savefig(temporary, format=kind, dpi=130, metadata=metadata)
@@ -190,16 +154,16 @@ class Picture(Bags, Times):
 @plot.command("path", epilog=epilog("plot"))
 @as_command("plot path")
 def plot_path(*, picture: Picture) -> None:
-    """Draw the driven path in 2D, coloured by time, with named places and standstills.
+    """Draw the driven path in 2D, with named places and standstills.
 
     Another topic of poses is chosen by data.pose_topic=TOPIC, a frame by data.map_frame=FRAME.
     """
     shown = picture.open_window()
     with spinner("looking for the path"):
-        frame, line = shown.path()
+        frame, line = _path_in(shown)
         summary = shown.recap()
-    with picture.figure(f"Path, {shown.title}", (8.5, 7.0), summary.notes) as figure:
-        _draw_path(figure.add_subplot(), shown.view.limits.places, frame, line, summary)
+    with picture.figure("Path", shown, summary.notes) as figure:
+        _draw_path(figure.add_subplot(), shown, frame, line, summary)
 
 
 @plot.command("signal", epilog=epilog("plot"))
@@ -209,24 +173,21 @@ def plot_signal(
         str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /battery.")
     ],
     *,
-    field: Annotated[
-        list[str] | None, "PATH", "A numeric field; repeatable (default: all that change)."
-    ] = None,
+    field: Annotated[list[str], "PATH", "A numeric field, such as position.x; repeatable."],
     picture: Picture,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     shown = picture.open_window()
     name = resolve_topic(shown.view, topic)
     with spinner(f"reading {name}"):
-        signals, notes = read_signals(shown, name, field or ())
-    size = (10.0, 1.2 + 1.9 * len(signals))
-    with picture.figure(f"{name}, {shown.title}", size, notes) as figure:
+        signals, notes = read_signals(shown, name, field)
+    with picture.figure(name, shown, notes, 1.2 + 1.9 * len(signals)) as figure:
         rows = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
         for axes, (field_name, (times_s, values)) in zip(rows, signals.items(), strict=True):
-            marker = "." if len(times_s) < _FEWEST_WITHOUT_MARKERS else ""
-            axes.plot(times_s / _DAY_S, values, linewidth=1.1, marker=marker)
+            # With marks, or a value between two gaps would not be seen.
+            axes.plot(times_s / _DAY_S, values, linewidth=1, marker=".", markersize=2)
             axes.set_title(field_name)
-        _label_times(rows[-1].xaxis, *shown.span)
+        _show_times(rows[-1], shown.span)
 
 
 @plot.command("timeline", epilog=epilog("plot"))
@@ -236,12 +197,8 @@ def plot_timeline(*, picture: Picture) -> None:
     shown = picture.open_window()
     with spinner("looking what was recorded when"):
         summary = shown.recap()
-        rows = event_rows(shown, summary) | topic_rows(shown)
-    notes = [*summary.notes]
-    if (left_out := len(shown.view.timeline.topics()) - _MOST_TOPICS) > 0:
-        notes.append(f"{counted(left_out, 'topic')} with the fewest messages left out")
-    size = (11.0, 1.3 + 0.27 * len(rows))
-    with picture.figure(f"Recorded, {shown.title}", size, notes) as figure:
+        rows = {**event_rows(shown, summary), **topic_rows(shown)}
+    with picture.figure("Recorded", shown, summary.notes, 1.3 + 0.27 * len(rows)) as figure:
         _draw_rows(figure.add_subplot(), rows, shown.span)
 
 
@@ -257,71 +214,13 @@ def plot_recap(*, picture: Picture) -> None:
         summary = shown.recap()
         rows = event_rows(shown, summary)
     height = 0.35 + 0.3 * len(rows)
-    with picture.figure(f"Recap, {shown.title}", (9.0, 6.0 + height), summary.notes) as figure:
+    with picture.figure("Recap", shown, summary.notes, 6.0 + height) as figure:
         plane, timeline = figure.subplots(2, 1, height_ratios=[6.0, height])
         plane.set_axis_off()
         with suppress(InvalidArgumentsError, NoDataError):  # a day without a path is drawn, too
-            frame, line = shown.path()
-            _draw_path(plane, shown.view.limits.places, frame, line, summary)
+            _draw_path(plane, shown, *_path_in(shown), summary)
             plane.set_axis_on()
         _draw_rows(timeline, rows, shown.span)
-
-
-def _draw_path(
-    axes: "Axes", places: Sequence[Place], frame: str, line: Line, summary: Recap
-) -> None:
-    """Draws a path coloured by time, with the named places and standstills of its frame."""
-    from matplotlib.collections import LineCollection  # noqa: PLC0415 - as above
-
-    for place in places:
-        if place.frame_id == frame:
-            left, right, low, high = place.region.bounds
-            middle = (left + right) / 2, (low + high) / 2
-            axes.annotate(place.name, middle, ha="center", color="#6b7280", fontsize=8)
-    points, times_s = np.column_stack([line.x, line.y]), line.times / NS_PER_S
-    is_drawn = ~line.begins[1:]
-    pieces = np.stack([points[:-1], points[1:]], axis=1)[is_drawn]
-    days = times_s[:-1][is_drawn] / _DAY_S
-    lines = LineCollection([*pieces], array=days, cmap="viridis", linewidths=2.0)
-    axes.add_collection(lines)
-    axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
-    axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
-    stops = [event.point for event in summary.events if event.kind == "stop" and event.point]
-    if stops and summary.frame_id == frame:
-        axes.scatter(*np.array(stops).T, s=60, color="#f59e0b", alpha=0.55, label="stood")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel(f"x (m, {frame})")
-    axes.set_ylabel("y (m)")
-    axes.legend(loc="best", fontsize=8)
-    if times_s[-1] > times_s[0] and axes.figure is not None:
-        bar = axes.figure.colorbar(lines, ax=axes, shrink=0.8, pad=0.02, label="time of day")
-        _label_times(bar.ax.yaxis, times_s[0], times_s[-1])
-
-
-def _draw_rows(axes: "Axes", rows: Rows, span: Seconds) -> None:
-    """Draws the rows of a timeline, the first one on top."""
-    start, end = span
-    shortest_s = max((end - start) * _LEAST_SHARE, 1e-6)
-    for row, stretches in enumerate(rows.values()):
-        bars = [
-            (first / _DAY_S, max(last - first, shortest_s) / _DAY_S) for first, last in stretches
-        ]
-        axes.broken_barh(bars, (row - 0.34, 0.68), facecolors=f"C{row}", linewidth=0)
-    axes.set_yticks(range(len(rows)), [shortened(name, _LONGEST_NAME) for name in rows])
-    axes.invert_yaxis()
-    axes.set_xlim(start / _DAY_S, (end + shortest_s) / _DAY_S)
-    _label_times(axes.xaxis, start, end + shortest_s)
-
-
-def _label_times(axis: "Axis", start: float, end: float) -> None:
-    """Labels an axis of days since 1970 with local times; `start` and `end` are Unix seconds."""
-    from matplotlib.dates import AutoDateLocator, DateFormatter  # noqa: PLC0415 - as above
-
-    # One offset from UTC for the whole axis: the one in its middle.
-    zone = datetime.fromtimestamp((start + end) / 2).astimezone().tzinfo
-    axis.set_major_locator(AutoDateLocator(tz=zone, maxticks=8))
-    form = "%H:%M:%S" if end - start < _DAY_S else "%d %b %H:%M"
-    axis.set_major_formatter(DateFormatter(form, tz=zone))
 
 
 def recorded_part(memory: Memory, window: TimeWindow) -> PlotWindow:
@@ -338,42 +237,93 @@ def recorded_part(memory: Memory, window: TimeWindow) -> PlotWindow:
     return PlotWindow(view, part)
 
 
+def _path_in(shown: PlotWindow) -> tuple[str, Line]:
+    """Returns the frame of the robot's path, and the path, which has at least one point.
+
+    Raises:
+        NoDataError: nothing places the robot in this time.
+    """
+    path, line, _ = line_in_box(shown.view.memory, Call(), shown.window, _EVERYWHERE)
+    if not len(line.times):
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "the robot has no place in this time")
+    return path.frame, line
+
+
+def _draw_path(axes: "Axes", shown: PlotWindow, frame: str, line: Line, summary: Recap) -> None:
+    """Draws a path, with the named places and standstills of its frame."""
+    for place in shown.view.limits.places:
+        if place.frame_id == frame:
+            left, right, low, high = place.region.bounds
+            axes.annotate(place.name, ((left + right) / 2, (low + high) / 2), ha="center")
+    breaks = np.flatnonzero(line.begins)
+    x, y = (np.insert(values, breaks, math.nan) for values in (line.x, line.y))
+    # With marks, or a point between two breaks would not be seen.
+    axes.plot(x, y, linewidth=1.5, marker=".", markersize=2)
+    axes.scatter(line.x[0], line.y[0], s=60, marker="o", color="C2", zorder=3, label="start")
+    axes.scatter(line.x[-1], line.y[-1], s=60, marker="s", color="C3", zorder=3, label="end")
+    stops = [event.point for event in summary.events if event.kind == "stop" and event.point]
+    if stops and summary.frame_id == frame:
+        axes.scatter(*np.array(stops).T, s=60, color="C1", alpha=0.55, label="stood")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"x (m, {frame})")
+    axes.set_ylabel("y (m)")
+    axes.legend()
+
+
+def _draw_rows(axes: "Axes", rows: Rows, span: Seconds) -> None:
+    """Draws the rows of a timeline, the first one on top."""
+    for row, stretches in enumerate(rows.values()):
+        bars = [(first / _DAY_S, (last - first) / _DAY_S) for first, last in stretches]
+        # The edge shows a moment, which is no time long.
+        axes.broken_barh(bars, (row - 0.34, 0.68), color=f"C{row}", linewidth=1)
+    axes.set_yticks(range(len(rows)), [*rows])
+    axes.invert_yaxis()
+    _show_times(axes, span)
+
+
+def _show_times(axes: "Axes", span: Seconds) -> None:
+    """Limits an axis of days since 1970 to a span, and labels it with local times."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter  # noqa: PLC0415 - as above
+
+    start, end = span
+    # One offset from UTC for the whole axis: the one in its middle.
+    zone = datetime.fromtimestamp((start + end) / 2).astimezone().tzinfo
+    locator = AutoDateLocator(tz=zone)
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=zone))
+    axes.set_xlim(start / _DAY_S, end / _DAY_S)
+
+
 def read_signals(
     shown: PlotWindow, topic: str, fields: Sequence[str]
 ) -> tuple[dict[str, Signal], list[str]]:
-    """Reads numeric fields of a topic: those that are named, else the first ones that change.
+    """Reads numeric fields of a topic.
 
     Returns the signals by dot-path, and notes.
 
     Raises:
         InvalidArgumentsError: the messages have no such field, or it holds no number.
     """
-    view = shown.view
-    total, picked = pick(view, topic, shown.window, _MOST_SAMPLES)
-    rows: list[dict[str, JsonValue]] = []
+    total, picked = pick(shown.view, topic, shown.window, _MOST_SAMPLES)
     times: list[Ns] = []
-    for time, value in extract_values(view, picked, fields, exact=True):
+    rows: list[list[float]] = []
+    for time, value in extract_values(shown.view, picked, fields, exact=True):
+        values = value if isinstance(value, dict) else {}
+        numbers = (values.get(field) for field in fields)
         times.append(time)
-        rows.append(dict(leaves(value)))
-    notes = [*view.notes.sentences()]
+        rows.append(
+            [number if isinstance(number, bool | int | float) else math.nan for number in numbers]
+        )
+    notes = [*shown.view.notes.sentences()]
     if total > len(rows):
         notes.append(f"{len(rows)} of {total} messages are drawn, evenly spaced")
-    names = fields or [*dict.fromkeys(name for row in rows for name in row)]
-    columns = {name: np.array([_number(row.get(name)) for row in rows]) for name in names}
-    numeric = [name for name, values in columns.items() if not np.isnan(values).all()]
-    if not numeric or (fields and numeric != [*fields]):
-        raise InvalidArgumentsError(f"{listed([*fields]) or topic} holds no number in this time")
-    drawn = numeric
-    if not fields:
-        varying = [name for name in numeric if np.nanmin(columns[name]) < np.nanmax(columns[name])]
-        drawn = (varying or numeric)[:_MOST_SIGNALS]
-        if left_out := varying[_MOST_SIGNALS:]:
-            notes.append(f"not drawn: {listed(left_out)}; name them with --field")
-    return {name: _broken_at_gaps(np.array(times), columns[name]) for name in drawn}, notes
-
-
-def _number(value: JsonValue) -> float:
-    return float(value) if isinstance(value, bool | int | float) else math.nan
+    columns = np.array(rows, np.float64).reshape(-1, len(fields)).T
+    signals = dict(zip(fields, columns, strict=True))
+    without_number = [field for field, values in signals.items() if np.isnan(values).all()]
+    if without_number:
+        raise InvalidArgumentsError(f"{listed(without_number)} holds no number in this time")
+    at = np.array(times)
+    return {field: _broken_at_gaps(at, values) for field, values in signals.items()}, notes
 
 
 def _broken_at_gaps(times: Ints, values: Floats) -> Signal:
@@ -394,21 +344,16 @@ def event_rows(shown: PlotWindow, summary: Recap) -> Rows:
         # A flip is a moment: its end is the time until which the new value stayed.
         end = event.start if event.end is None or event.kind == "flip" else event.end
         rows.setdefault(event.kind, []).append(_in_seconds((event.start, end)))
-    return {**rows}
+    return rows
 
 
 def topic_rows(shown: PlotWindow) -> Rows:
-    """Returns when each topic was recorded, by name: of the topics with the most messages."""
+    """Returns when each topic was recorded, by name."""
     timeline = shown.view.timeline
-    messages = {
-        topic: sum(totals.messages for totals in timeline.totals(topic).values())
-        for topic in timeline.topics()
-    }
-    most_first = sorted(messages, key=lambda topic: -messages[topic])
     # A topic that lacks one split is not shown as interrupted.
     joined = ns_from_unix(2 * shown.view.limits.split_duration_s)
     rows: dict[str, Sequence[Seconds]] = {}
-    for topic in sorted(most_first[:_MOST_TOPICS]):
+    for topic in sorted(timeline.topics()):
         extents = ((first, last) for _, first, last in timeline.extents(topic, shown.window))
         rows[topic] = [*map(_in_seconds, united(extents, joined))]
     return rows

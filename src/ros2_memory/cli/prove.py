@@ -76,51 +76,35 @@ def prove(
         expected = _answer(settings, replace(memory, reader=cast("BagReader", log)), words)
     view = View(memory, Call())
     require_bags(view)
-    read = log.spans()
-    parts = _parts_without_gaps(view)
+    read, parts, definitions = log.spans(), _parts_without_gaps(view), Definitions(memory.reader)
     own_settings = [word for word in bags.words or () if not is_folder(word)]
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
-        for attempt, spans in enumerate(_ever_more_spans(view, read, parts)):
-            path = Path(folder) / str(attempt) / output.name
+        everything = {topic: [(MIN_NS, MAX_NS)] for topic in view.timeline.topics()}
+        for name, spans in (("read", _read_and_ends(view, read, parts)), ("all", everything)):
+            path = Path(folder) / name / output.name
             path.parent.mkdir()
-            definitions = Definitions(memory.reader)
             count = _write_copy(path, view, spans, parts, definitions)
-            copied, _ = load_to_look(None, [str(path), *looking, *own_settings])
+            copied = load_to_look(None, [str(path), *looking, *own_settings])
             repeated = _answer(copied, open_memory(copied, verbose=bags.verbose), words)
             differing = _differing_keys(expected, repeated)
-            if not differing.of_answer:
+            if not differing:
                 break
         path.replace(output)
     if as_json:
-        keys = {"differing": differing.of_answer, "beside": differing.of_files}
-        same = not differing.of_answer
-        print_json({"path": str(output), "messages": count, "same": same, **keys})
+        same = {"same": not differing, "differing": differing}
+        print_json({"path": str(output), "messages": count, **same})
     else:
         print_line(f"{counted(count, 'message')} in {output}")
-    if differing.of_files:
-        print_notes([f"only the bags themselves give the same {listed(differing.of_files)}"])
-    print(_verdict(differing, words, output, len(parts)), file=sys.stderr)
+    verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
+    if differing:
+        verdict = f"over {output} the answer differs in {listed(differing)}"
+        if len(parts) > 1 and output.suffix == ".mcap":
+            verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
+    print(verdict, file=sys.stderr)
     if definitions.undefined:
         print_notes([definitions.describe_undefined()])
     types = {name for topic in read for name in view.timeline.types_of(topic)}
-    return bool(differing.of_answer or not types.isdisjoint(definitions.undefined))
-
-
-class _DifferingKeys(NamedTuple):
-    """The keys in which two replies differ: those on what lies in which file, and all others."""
-
-    of_files: list[str]
-    of_answer: list[str]
-
-
-def _verdict(differing: _DifferingKeys, words: Sequence[str], output: Path, parts: int) -> str:
-    """Returns a sentence on whether the copy gives the same answer, and what to do if not."""
-    if not differing.of_answer:
-        return f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
-    verdict = f"over {output} the answer differs in {listed(differing.of_answer)}"
-    if parts > 1 and output.suffix == ".mcap":
-        verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
-    return verdict
+    return bool(differing or not types.isdisjoint(definitions.undefined))
 
 
 class _ReadLog:
@@ -201,26 +185,15 @@ def _parts_without_gaps(view: View) -> list[_Part]:
     ]
 
 
-def _ever_more_spans(
+def _read_and_ends(
     view: View, read: Mapping[str, Spans], parts: Sequence[_Part]
-) -> Iterator[dict[str, Spans]]:
-    """Yields the times of each topic to copy: those that were read, then more and more, then all.
+) -> dict[str, Spans]:
+    """Returns the times of each topic that were read, and of all topics the ends of each part.
 
-    All topics are copied at some ends: the first and the last message of all say when "now" is,
-    those of each part say from when to when something was recorded.
+    The first and the last message of a part say from when to when something was recorded.
     """
     ends = [(at, at + 1) for part in parts for at in (part.window.start, part.window.stop - 1)]
-    ends.sort()
-    outermost, ever = [ends[0], ends[-1]], [(MIN_NS, MAX_NS)]
-    topics = view.timeline.topics()
-    attempts: list[tuple[Mapping[str, Spans], Spans]] = [
-        (read, outermost),
-        (read, ends),
-        (dict.fromkeys(read, ever), ends),
-        (dict.fromkeys(topics, ever), ends),
-    ]
-    for spans, ends_of_all in attempts:
-        yield {topic: united([*spans.get(topic, ()), *ends_of_all]) for topic in topics}
+    return {topic: united([*read.get(topic, ()), *ends]) for topic in view.timeline.topics()}
 
 
 def _write_copy(
@@ -296,13 +269,11 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     return answer
 
 
-def _differing_keys(expected: JsonValue, repeated: JsonValue) -> _DifferingKeys:
+def _differing_keys(expected: JsonValue, repeated: JsonValue) -> list[str]:
+    """Returns the keys in which two replies differ, but for keys on how messages lie in files."""
     one = _NEVER if expected is None else expected
     other = _NEVER if repeated is None else repeated
     if not isinstance(one, dict) or not isinstance(other, dict):
-        return _DifferingKeys([], [] if one == other else ["all"])
-    differing = _DifferingKeys([], [])
-    for key in dict.fromkeys((*one, *other)):
-        if one.get(key) != other.get(key):
-            (differing.of_files if key in _KEYS_ON_FILES else differing.of_answer).append(key)
-    return differing
+        return [] if one == other else ["all"]
+    keys = dict.fromkeys((*one, *other))
+    return [key for key in keys if key not in _KEYS_ON_FILES and one.get(key) != other.get(key)]

@@ -32,7 +32,7 @@ def sql(
     """
     if as_csv and as_json:
         raise InvalidArgumentsError("give --csv or --json, not both")
-    settings, _ = load_for(None, ["deployment=query_only", "lake=duckdb", *(overrides or ())])
+    settings = load_for(None, ["deployment=query_only", "lake=duckdb", *(overrides or ())])
     lake = open_lake(settings, cast("DuckdbNode", settings.lake.engine))
     if not lake.days("bags"):
         raise InvalidArgumentsError(f"{settings.lake.warehouse}: there is no lake, or no bag in it")

@@ -23,10 +23,9 @@ from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, ROS_LOG_DIR
 from ros2_memory.bootstrap import build_reader
-from ros2_memory.cli.options import BagDir, Overrides, load_for
+from ros2_memory.cli.options import BagDir, Overrides
 from ros2_memory.cli.output import (
     escape,
-    format_duration,
     format_size,
     print_line,
     spinner,
@@ -43,12 +42,18 @@ from ros2_memory.cli.proposal import (
     select,
     topics_yaml,
 )
-from ros2_memory.config import NullRecorderNode, Settings, config_dir, is_deployment_chosen
+from ros2_memory.config import (
+    NullRecorderNode,
+    Settings,
+    config_dir,
+    is_deployment_chosen,
+    load_explained,
+)
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import Ns, WallClock, unix_from_ns
+from ros2_memory.core.timebase import Ns, iso_local, unix_from_ns
 from ros2_memory.recorder.process.child import Child, Patience, end_all
 from ros2_memory.recorder.process.command import record_argv, storage_config
 from ros2_memory.recorder.process.installation import (
@@ -96,13 +101,11 @@ class Survey(NamedTuple):
 
     Attributes:
         topics: by name; without those that a recorder offers itself.
-        unknown_types: topics that cannot be recorded, because their type is not installed.
         ratio: compressed bytes of a byte, over all that was recorded.
         fixed_bytes: the size of a file without messages.
     """
 
     topics: Sequence[Offered]
-    unknown_types: Sequence[str]
     ratio: float
     fixed_bytes: int
 
@@ -137,7 +140,9 @@ def up(
     words = [*(words or ())]
     if not is_deployment_chosen(words):
         words.insert(0, "deployment=robot")
-    settings, sources = load_for(bag_dir, words)
+    if bag_dir is not None:
+        words.append(f"recording.bag_dir={quoted(str(bag_dir.absolute()))}")
+    settings, sources = load_explained(words)
     if isinstance(settings.recorder, NullRecorderNode) or settings.server.transport == "stdio":
         raise ConfigError(
             "`up` records, and serves over HTTP: choose deployment=robot, or recorder=ros2bag and "
@@ -215,7 +220,7 @@ def _require_messages(robot: _Robot, survey: Survey) -> None:
         RecorderError: they are not; the sentence says what to do.
     """
     light = select(judge(survey.topics), Choice.RECORD)
-    if not survey.topics and not survey.unknown_types:
+    if not survey.topics:
         advice = advice_on_rmw(robot.ros.env)
         raise RecorderError(
             f"no topic is offered in {robot.where} (waited {LOOK_S:g} s); start the robot's nodes, "
@@ -238,7 +243,7 @@ def _write_proposal(robot: _Robot, survey: Survey, disk: Disk, *, yes: bool) -> 
     """
     proposal = propose(survey.topics, disk)
     recorded = select(proposal, Choice.RECORD)
-    _print_topics(proposal, disk, recorded, survey)
+    _print_topics(proposal, disk, recorded)
     if not recorded:
         raise RecorderError(
             "nothing of this is proposed; write a list of topics, and name it with "
@@ -279,17 +284,15 @@ def _show_list(robot: _Robot, survey: Survey, disk: Disk) -> None:
     selection = load_topics(robot.list_file)
     proposal = propose(survey.topics, disk)
     recorded = [topic for topic in survey.topics if selection.matches(topic.topic)]
-    _print_topics(proposal, disk, recorded, survey)
+    _print_topics(proposal, disk, recorded)
     print_line(f"{robot.list_file} is used as it is")
     missing = [topic.topic for topic in select(proposal, Choice.RECORD) if topic not in recorded]
     if missing:
         print_line(f"it lacks, of what would be proposed: {', '.join(missing)}")
 
 
-def _print_topics(
-    proposal: Proposal, disk: Disk, recorded: Sequence[Offered], survey: Survey
-) -> None:
-    """Prints a line for each topic, what the recorded ones take, and topics of unknown types."""
+def _print_topics(proposal: Proposal, disk: Disk, recorded: Sequence[Offered]) -> None:
+    """Prints a line for each topic, and what the recorded ones take."""
     width = max((len(topic.topic) for topic in proposal), default=0)
     for topic, verdict in proposal.items():
         sign, detail = "record", topic.type
@@ -302,11 +305,6 @@ def _print_topics(
             daily = f"{format_size(disk.bytes_per_day([topic]))} a day"
         print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
     print_line(_describe_estimate(disk, recorded))
-    if survey.unknown_types:
-        print_line(
-            f"ros2 bag record does not know the types of {listed(survey.unknown_types)}; name "
-            "the setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
-        )
 
 
 def _describe_estimate(disk: Disk, recorded: Sequence[Offered]) -> str:
@@ -374,18 +372,15 @@ def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
 
 
 def _show_until_one_ends(programs: Mapping[str, Child], bag_dir: Path) -> str:
-    """Shows what is recorded until a program ends; returns which one, and its last line."""
+    """Shows what is recorded until a program ends; returns which one."""
     shown, due_s = "", 0.0
-    last_line = dict.fromkeys(programs, "it gave no reason")
     while True:
         for name, child in programs.items():
             status = child.exit_status()
             for line in filter(None, map(escape, child.take_lines())):
-                if "http://" not in line:  # the address of the page is no reason
-                    last_line[name] = line
                 print_line(f"{name}: {line}")
             if status is not None:
-                return f"the {name} ended with status {status}: {last_line[name]}"
+                return f"the {name} ended with status {status}"
         heartbeat = read_heartbeat(bag_dir).heartbeat
         if heartbeat is not None and heartbeat.pid == programs["recorder"].pid:
             topics = len({*heartbeat.subscribed} - {*heartbeat.silent})
@@ -398,8 +393,8 @@ def _show_until_one_ends(programs: Mapping[str, Child], bag_dir: Path) -> str:
 
 def _describe_recorder(heartbeat: Heartbeat, topics: int) -> str:
     """Returns a line on the recorder's state, and the number of topics that it receives."""
-    for_s = unix_from_ns(WallClock().now() - heartbeat.since)
-    line = f"recorder: {heartbeat.state} for {format_duration(for_s)}, {counted(topics, 'topic')}"
+    since = iso_local(heartbeat.since)
+    line = f"recorder: {heartbeat.state} since {since}, {counted(topics, 'topic')}"
     if heartbeat.silent:
         line += f", silent: {listed(heartbeat.silent)}"
     line += f", {format_size(heartbeat.bytes_written)}"
@@ -427,18 +422,17 @@ def survey_topics(ros: Installation, reader: BagReader, chunk_bytes: int) -> Sur
             channel.topic: Offered(
                 channel.topic, re.sub(r"[^\w/]", "?", channel.type), channel.latched
             )
-            for channel in reader.channels(empty.file)
+            for channel in reader.channels(empty)
             if not _OWN.match(channel.topic)
         }
         # Neither pixels nor what people say is recorded even now.
         light = tuple(topic.topic for topic in select(judge(offered.values()), Choice.RECORD))
-        fixed, ratio = empty.file.stat().st_size, 1.0
+        fixed, ratio = empty.stat().st_size, 1.0
         if light:
-            bag = _record(ros, folder / "measure", TopicSelection(light), SECONDS, light).file
+            bag = _record(ros, folder / "measure", TopicSelection(light), SECONDS, light)
             topics, ratio = _measure(reader, bag, offered, fixed)
             offered |= topics
-    topics_by_name = [offered[topic] for topic in sorted(offered)]
-    return Survey(topics_by_name, sorted(empty.unknown_types), ratio, fixed)
+    return Survey([offered[topic] for topic in sorted(offered)], ratio, fixed)
 
 
 def _measure(
@@ -472,13 +466,6 @@ def _measure(
     return measured, min(max(ratio, LEAST_RATIO), 1.0)
 
 
-class _Recording(NamedTuple):
-    """A short recording: its file, and the topics whose types are not installed."""
-
-    file: Path
-    unknown_types: set[str]
-
-
 def _record(
     ros: Installation,
     directory: Path,
@@ -487,8 +474,10 @@ def _record(
     expected: Collection[str] = (),
     *,
     options: Sequence[str] = (),
-) -> _Recording:
+) -> Path:
     """Records until all expected topics (or any) are subscribed, and no further one for `quiet_s`.
+
+    Returns the bag file.
 
     Raises:
         RecorderError: `ros2 bag record` ended by itself, or wrote no file.
@@ -505,16 +494,16 @@ def _record(
         known_options=ros.options,
     )
     child = Child.start([*argv, *options], {**ros.env, "ROS_LOG_DIR": str(directory.parent)})
-    subscribed, unknown_types = set[str](), set[str]()
-    topics_by_kind = {LineKind.SUBSCRIBED: subscribed, LineKind.UNKNOWN_TYPE: unknown_types}
+    subscribed = set[str]()
     lines: list[str] = []
     began = changed = time.monotonic()
     try:
         while child.exit_status() is None and time.monotonic() < began + LOOK_S + quiet_s:
             for line in map(parse_line, child.take_lines()):
                 lines.append(line.text)
-                if line.topic and line.kind in topics_by_kind and not _OWN.match(line.topic):
-                    topics_by_kind[line.kind].add(line.topic)
+                topic = line.topic if line.kind is LineKind.SUBSCRIBED else None
+                if topic and not _OWN.match(topic):
+                    subscribed.add(topic)
                     changed = time.monotonic()
             has_all = subscribed and subscribed.issuperset(expected)
             if has_all and time.monotonic() > changed + quiet_s:
@@ -532,4 +521,4 @@ def _record(
             f"ros2 bag record ended by itself (status {status}): {words}; `ros2-memory doctor` "
             "checks the installation"
         )
-    return _Recording(file, unknown_types)
+    return file

@@ -8,10 +8,11 @@ from dataclasses import replace
 from typing import Annotated, Final
 
 import numpy as np
+from rich.console import Console
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.options import AsJson, Bags
-from ros2_memory.cli.output import print_json, print_reply, stdout_console
+from ros2_memory.cli.output import print_json, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import JsonObject
@@ -57,7 +58,7 @@ def watch(
             if as_json:
                 print_json(seen)
             else:
-                stdout_console().clear()  # of a terminal alone
+                Console().clear()  # of a terminal alone
                 print_reply(seen)
             if number == count:
                 break

@@ -188,38 +188,3 @@ class _LibraryFilter(logging.Filter):
         if count > 1:
             record.suppressed = count - 1
         return count > 0
-
-
-def withhold_warnings() -> None:
-    """Counts warnings from here on instead of logging them; errors are logged as ever.
-
-    For programs whose output people read. The next `configure_logging` ends it.
-    """
-    for handler in logging.getLogger().handlers:
-        handler.addFilter(_WarningCounter())
-
-
-def withheld_warnings() -> Counter[str]:
-    """Returns how often each event was withheld, and begins to count anew."""
-    total = Counter[str]()
-    for handler in logging.getLogger().handlers:
-        for log_filter in handler.filters:
-            if isinstance(log_filter, _WarningCounter):
-                total += log_filter.counts
-                log_filter.counts.clear()
-    return total
-
-
-class _WarningCounter(logging.Filter):
-    """Drops warnings, and counts them: by event, or by the name of a library's logger."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.counts = Counter[str]()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        if record.levelno != logging.WARNING:
-            return True
-        event: object = record.msg
-        self.counts[str(event.get("event")) if isinstance(event, dict) else record.name] += 1
-        return False

@@ -27,7 +27,7 @@ from ros2_memory.config import (
     Settings,
     exit_on_config_error,
     files_in_use,
-    load_explained,
+    load_settings,
     unused_config,
 )
 from ros2_memory.core.errors import ConfigError, EpisodicError
@@ -79,14 +79,10 @@ def _run(overrides: Sequence[str]) -> int:
     Raises:
         ConfigError: the configuration is refused.
     """
-    settings, sources = load_explained(overrides)
+    settings = load_settings(overrides)
     configure_logging(settings.logging.level, settings.logging.format)
     if isinstance(settings.recorder, NullRecorderNode):
-        _, chosen_by = sources.choice("recorder")
-        _log.info(
-            "nothing_to_record",
-            reason=f"recorder=none: bags come from elsewhere (set {chosen_by})",
-        )
+        _log.info("nothing_to_record", reason="recorder=none: bags come from elsewhere")
         # A service manager restarts a program for ever that ends before it is ready.
         notify(READY)
         return 0

@@ -85,9 +85,8 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("cat /odom . --tail=0", "--limit and --tail must be more than 0"),
         ("cat /odom gone", "gone: there is no such file or folder"),
         ("cat a /odom", "/odom: there is no such file or folder"),
-        # People read commands where an error names a tool.
-        ("cat /odom empty", "; `ros2-memory info` lists"),
-        ("cat /nothing a", "; `ros2-memory topics` lists"),
+        ("cat /odom empty", "contains no bag with messages"),
+        ("cat /nothing a", "no topic /nothing is recorded"),
         ("cat '/\x1b[31m' .", "/\\x1b[31m"),
         ("export .", "give one of --mcap FILE and --parquet DIR"),
         ("export . --mcap x --parquet b", "give one of --mcap FILE and --parquet DIR"),
@@ -134,7 +133,7 @@ def test_a_deployment_that_records_there_is_looked_at_as_it_is(
     assert (budget("info . --json"), budget("info a --json")) == (5.0, None)
 
 
-def test_topics_without_messages_are_named_and_the_first_of_many_faults_of_clocks(
+def test_topics_without_messages_are_named_and_all_faults_of_clocks(
     tmp_path: Path, exits: Program
 ) -> None:
     declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
@@ -144,9 +143,7 @@ def test_topics_without_messages_are_named_and_the_first_of_many_faults_of_clock
         write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
     words = " ".join(exits(0, f"info {tmp_path}").out.split())
     assert "topics_without_messages /idle, /lost" in words
-    assert "silent_topics" not in words
-    assert words.count("the clock was not set") == 10
-    assert "2 more clock_faults: --json prints them" in words
+    assert words.count("the clock was not set") == 12
     reply = exits(0, f"info {tmp_path} --json").json
     assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
     assert len(reply["data_time_range"]["clock_faults"]) == 12
@@ -366,9 +363,8 @@ def test_where_something_is_recorded_info_says_for_how_long_the_budget_lasts(
     monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
     recording_now(folder, "b", clock=later(0))
     shown = exits(0, "info deployment=robot retention.max_total_gb=2.0").out
-    assert "of 2 GB: bags 0" in shown
-    assert "what is stored beside them 0" in shown
-    assert "full in" in shown
+    assert re.search(r"budget\.max_gb +2\n", shown)
+    assert "budget.full_in_days" in shown
 
 
 def test_config_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
@@ -382,46 +378,19 @@ def test_config_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
     assert shown["recording"]["bag_dir"] == "/bags"
     assert shown["storage"]["_target_"].startswith("ros2_memory.")
     assert "MEMORY_API_TOKEN is set" in text
+    assert "/config.yaml\n" in text
     assert "a-secret" not in text
 
 
-def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
-    monkeypatch: pytest.MonkeyPatch, exits: Program
+def test_without_v_no_warning_is_logged_and_with_it_the_events(
+    folder: Path, exits: Program
 ) -> None:
-    monkeypatch.setenv("MEMORY_BAG_DIR", "/bags")
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
-    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
-    monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", "/")
-    head, *rows = exits(0, "config show --sources server.port=9300").out.splitlines()
-    assert head.startswith("# files are those of ")
-    told = {
-        key: f"{rest} " for key, _, rest in (" ".join(row.split()).partition(" ") for row in rows)
-    }
-    for key, who in (
-        ("deployment", "by MEMORY_DEPLOYMENT "),
-        ("storage", "deployment/robot.yaml "),
-        ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
-        ("server.port", "on the command line "),
-        ("server.name", "config.yaml "),
-        ("server.transport", "deployment/robot.yaml "),
-        ("reader.include_active", "deployment/robot_live.yaml "),
-        ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
-        ("recording.bag_dir", "by MEMORY_BAG_DIR "),
-        ("recorder._target_", "recorder/none.yaml "),
-    ):
-        assert told[key].startswith(who), key
-
-
-def test_warnings_are_one_sentence_and_with_v_the_events(folder: Path, exits: Program) -> None:
     for name in "ab":
         (folder / "a" / f"{name}.mcap").write_bytes(b"")
         os.utime(folder / "a" / f"{name}.mcap", (1_700_000_000,) * 2)
-    (line,) = exits(0, "topics .").err.splitlines()
-    assert "2 warnings logged (2 x bag_damaged); -v shows" in line
-    output = [
-        json.loads(line) for line in exits(0, "topics . -v logging.level=warning").err.splitlines()
-    ]
-    assert [each["event"] for each in output] == ["bag_damaged", "bag_damaged"]
+    assert exits(0, "topics .").err == ""
+    lines = exits(0, "topics . -v logging.level=warning").err.splitlines()
+    assert [json.loads(line)["event"] for line in lines] == ["bag_damaged", "bag_damaged"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import pytest
 
-from ros2_memory.cli.output import format_time, format_value, print_reply, with_commands
+from ros2_memory.cli.output import format_time, format_value, print_reply
 from ros2_memory.core.model import JsonValue
+from tests.support.program import Printed
 
-Shown = Callable[..., str]
+Shown = Callable[..., Printed]
 T0 = 1_700_000_000.25
 
 
@@ -15,12 +16,10 @@ T0 = 1_700_000_000.25
 def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Shown:
     """What is printed of a reply in so many columns."""
 
-    def run(value: JsonValue, width: int = 80, now: float | None = None) -> str:
+    def run(value: JsonValue, width: int = 80) -> Printed:
         monkeypatch.setenv("COLUMNS", str(width))
-        print_reply(value, now)
-        lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-        assert all(len(line) <= width for line in lines)
-        return "\n".join(lines)
+        print_reply(value)
+        return Printed(*capsys.readouterr())
 
     return run
 
@@ -28,76 +27,50 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("value", "output"),
     [
-        ({"x": 1.5, "y": 2, "z": 0.0}, "x 1.5, y 2, z 0"),
-        ({"x": 1.5, "y": 2, "z": 0.4, "yaw_deg": 90.0}, "x 1.5, y 2, z 0.4, yaw_deg 90"),
-        ({"x": 1.5, "y": 2, "frame_id": "map"}, "x 1.5, y 2 (map)"),
-        ({"x": 0, "y": 0, "z": 0, "w": 1}, "x 0, y 0, z 0, w 1"),
-        ({"value": "cup"}, "cup"),
-        ({"label": "cup", "score": 0.9}, "label: cup; score: 0.9"),
-        ({"label": "cup", "at": {"x": 1, "y": 2}}, "label: cup; at (x 1, y 2)"),
+        (T0, format_time(T0)),
+        (True, "true"),
+        (0.1 + 0.2, "0.3"),
+        (["a", 2], "a, 2"),
+        ({"label": "cup", "at": {"x": 1, "y": 2}}, "label: cup; at.x: 1; at.y: 2"),
         ([{"label": "cup"}, {"label": "\x1b[0m"}], "label: cup | label: \\x1b[0m"),
+        (None, "-"),
         ([], "-"),
         ({}, "-"),
     ],
 )
-def test_objects_in_a_cell_are_words(value: JsonValue, output: str) -> None:
+def test_a_value_in_a_cell_is_one_line(value: JsonValue, output: str) -> None:
     assert format_value(value) == output
 
 
-def test_a_moment_has_its_local_time_and_its_age_and_what_there_is_not_is_in_words(
-    shown: Shown,
-) -> None:
-    output = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
-    assert output.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
-    assert f"{format_time(T0 - 7200)} (2.0 h ago)" in output
-    assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
-    # That of a clock that was never set has its unit.
-    assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
-    assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
-    assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
-    assert shown([]) == "none"
+def test_a_reply_is_a_line_for_each_value_and_its_notes_are_on_stderr(shown: Shown) -> None:
+    printed = shown({"at": T0, "value": {"x": 1}, "gaps": [], "notes": ["one", "two"]})
+    lines = [line.split() for line in printed.out.splitlines()]
+    assert lines == [["at", format_time(T0)], ["value.x", "1"], ["gaps", "-"]]
+    assert printed.err == "note: one\nnote: two\n"
+    assert shown([]).out == "none\n"
 
 
-def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
-    assert with_commands("the tools are: list_recorded_topics, visits").endswith(
-        "list_recorded_topics, visits"
-    )
-    assert with_commands("list_recorded_topics lists all") == "`ros2-memory topics` lists all"
-
-
-def test_counts_by_day_are_a_table_whose_last_row_is_of_all(shown: Shown) -> None:
-    """Of a time that stands there twice, as text and exactly, people get the exact one."""
+def test_rows_with_named_columns_are_a_table(shown: Shown) -> None:
     reply: JsonValue = {
         "topic": "/bumper",
-        "columns": ["day", "count", "first", "first_unix"],
-        "rows": [["2026-11-16", 2, "09:00:00", T0], ["2026-11-17", 0, None, None]],
-        "all": [2, "09:00:00", T0],
+        "columns": ["day", "count"],
+        "rows": [["2026-11-16", 2], ["2026-11-17", None]],
     }
-    lines = [line.split() for line in shown(reply).splitlines() if line]
-    assert lines[:3] == [["topic", "/bumper"], ["rows"], ["day", "count", "first"]]
-    assert lines[-3:] == [
-        ["2026-11-16", "2", format_time(T0)],
-        ["2026-11-17", "0", "-"],
-        ["all", "2", format_time(T0)],
-    ]
+    lines = [line.split() for line in shown(reply).out.splitlines()]
+    assert lines[0] == ["topic", "/bumper"]
+    for row in (["rows"], ["day", "count"], ["2026-11-16", "2"], ["2026-11-17", "-"]):
+        assert row in lines
 
 
-def test_in_a_narrow_terminal_moments_are_broken_and_wide_rows_stand_one_below_the_other(
-    shown: Shown,
-) -> None:
-    rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
-    output = shown(rows)
-    for part in format_time(T0).split("T"):
-        assert [line.count(part) for line in output.splitlines() if part in line] == [2]
+def test_in_a_narrow_terminal_wide_rows_stand_one_below_the_other(shown: Shown) -> None:
+    row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(10)}
+    assert shown([row, row]).out.count("a_key_with_a_long_name_5  5\n") == 2
+    assert shown([row, row], width=300).out.count("a_key_with_a_long_name_5") == 1
+
+
+@pytest.mark.parametrize("width", [0, 40])
+def test_however_narrow_a_terminal_is_nothing_of_a_table_is_cut(shown: Shown, width: int) -> None:
+    """The width is 0 on some serial lines."""
+    output = shown([{"topic": "/a_long_name" * 5, "count": 12345}], width).out
+    assert "".join(output.split()).count("/a_long_name") >= 1
     assert "12345" in output
-    row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
-    assert shown([row, row]).count("a_key_with_a_long_name_5  5") == 2
-    assert shown([row, row], width=200).count("a_key_with_a_long_name_5") == 1
-
-
-def test_a_serial_line_of_no_columns_shows_tables_too(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "0")
-    print_reply([{"topic": "/odom", "count": 5}])
-    assert "/odom" in capsys.readouterr().out

@@ -75,7 +75,9 @@ def whole_memory(bags: Path) -> plot.PlotWindow:
     return plot.recorded_part(memory_of(bags), TimeWindow.everything())
 
 
-@pytest.mark.parametrize("kind", ["path", "signal /battery_state", "timeline", "recap"])
+@pytest.mark.parametrize(
+    "kind", ["path", "signal /battery_state --field percentage", "timeline", "recap"]
+)
 def test_each_is_a_picture_of_the_asked_kind(
     bags: Path, tmp_path: Path, exits: Program, kind: str
 ) -> None:
@@ -89,8 +91,7 @@ def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> N
     signals, _ = plot.read_signals(whole_memory(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
     assert (len(charge), charge[0], charge[-1]) == (30, 80.0, 51.0)
-    signals, notes = plot.read_signals(whole_memory(bags), "/odom", [])
-    assert [*signals] == ["position.x", "position.y"]  # nothing else changes
+    signals, notes = plot.read_signals(whole_memory(bags), "/odom", ["position.x", "position.y"])
     assert sum(map(math.isnan, signals["position.x"][1])) == 1
     assert notes == []
 
@@ -110,7 +111,7 @@ def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("path --out path.jpeg", "must end in .svg, .png, .pdf"),
+        ("path --out path.jpeg", "must end in .svg, .png"),
         ("signal /chatter --out a.svg --field data", "holds no number"),
         ("signal /odom --out a.svg --field pose.no", "has no field"),
         ("timeline --out a.svg --end 2001-01-01", "nothing was recorded in this"),

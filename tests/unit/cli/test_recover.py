@@ -57,7 +57,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert repaired.startswith(f"a/a_1.mcap: repaired: {count} messages")
     assert removed == "b/b_0.mcap: empty, removed"
     assert others.startswith("1 bag file of another kind was left alone")
-    assert metadata == f"{tmp_path}/a/metadata.yaml: written to match the files"
+    assert metadata == f"{tmp_path}/a/metadata.yaml: made to match the files"
     assert summary == outcome.summary()
 
 
@@ -100,7 +100,7 @@ def test_metadata_that_speaks_of_more_than_there_is_is_corrected(tmp_path: Path)
     os.truncate(cut, cut.stat().st_size - 3000)
     (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
     _, printed = recovered(tmp_path / "rec")
-    assert any("metadata.yaml: rewritten" in line for line in printed)
+    assert any("metadata.yaml: made to match" in line for line in printed)
     held = McapReader().summarize(tmp_path / "rec/rec.mcap")
     assert 0 < held.count < 100
     assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}

@@ -136,21 +136,15 @@ def test_one_pass_does_not_wait_before_its_last_batch(
 
 
 def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
-    ship: Ship,
-    fleet: Path,
-    tmp_path: Path,
-    capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
+    ship: Ship, fleet: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    shutil.copytree(fleet / "hall", tmp_path / "hall")
-    (tmp_path / "hall" / "recorder.json").touch()  # a recorder has recorded here
-    robots, lake = f"fleet.robots={{hall: {tmp_path}/hall}}", tmp_path / "lake"
+    robots, lake = f"fleet.robots={{hall: {fleet}/hall}}", tmp_path / "lake"
 
     def found(*more: str) -> dict[str, list[str]]:
         cli.main(["doctor", "--json", robots, f"lake.warehouse={lake}", *more])
         seen: dict[str, list[str]] = {}
         for each in json.loads(capsys.readouterr().out)["findings"]:
-            if each["about"] == "lake" or "receipts" in each["seen"]:
+            if each["about"] == "lake":
                 seen.setdefault(f"{each['about']} {each['level']}", []).append(each["seen"])
         return seen
 
@@ -160,14 +154,6 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     told = found()
     assert [*told] == ["lake ok"]
     assert "its bags last changed" in told["lake ok"][0]
-    can = os.access
-    own = tmp_path / "hall" / ".episodic"
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: own not in Path(path).parents and can(path, mode)
-    )
-    [told_of] = found()["robot warning"]
-    assert "hall: " in told_of
-    assert "can never work" in told_of
     shutil.rmtree(lake / "ros2_memory")
     assert "looking into the lake failed" in found()["lake error"][0]
 

@@ -80,18 +80,14 @@ def test_messages_that_two_recordings_have_count_once(bag_dir: Path, exits: Prog
 
 def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "none").mkdir()
-    assert "latest          none" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
+    shown = exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
+    assert re.search(r"^latest +-$", shown, re.MULTILINE)
 
 
-def test_old_data_is_not_judged_by_what_is_usual_and_is_as_old_as_the_tools_say(
-    tmp_path: Path, exits: Program
-) -> None:
+def test_old_data_is_not_judged_by_what_is_usual(tmp_path: Path, exits: Program) -> None:
     messages = [odom((1_700_000_000 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
     bag = write_mcap(tmp_path / "old" / "rec" / "rec_0.mcap", messages)
     os.utime(bag, (1_700_000_010,) * 2)
     output = exits(0, f"watch --count 1 --bag-dir {tmp_path}/old").out
     assert "as usual" not in output
-    assert "days ago" in output
     assert re.search(r"is_live +false", output)
-    output = exits(0, f"watch --count 1 --bag-dir {tmp_path}/old data.now=latest").out
-    assert "days ago" not in output

@@ -12,12 +12,7 @@ import structlog
 from mcp.server import streamable_http as transport
 
 from ros2_memory.core import logging_setup
-from ros2_memory.core.logging_setup import (
-    configure_logging,
-    get_logger,
-    withheld_warnings,
-    withhold_warnings,
-)
+from ros2_memory.core.logging_setup import configure_logging, get_logger
 
 
 @pytest.fixture(autouse=True)
@@ -62,20 +57,6 @@ def test_an_exception_does_not_show_local_variables(
     assert out == ""
     assert "ValueError: bad bag" in err
     assert "hunter2" not in err
-
-
-def test_withheld_warnings_are_counted_by_event_and_errors_are_shown(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    configure_logging("warning", "json")
-    withhold_warnings()
-    get_logger("ours").warning("bag_damaged", path="a")
-    get_logger("ours").warning("bag_damaged", path="b")
-    logging.getLogger("theirs").warning("100 %% of %s", "it")
-    get_logger("ours").error("not_deleted")
-    assert withheld_warnings() == {"bag_damaged": 2, "theirs": 1}
-    assert withheld_warnings() == {}
-    assert [each["event"] for each in events(capsys)] == ["not_deleted"]
 
 
 def test_what_a_library_repeats_is_logged_now_and_then(

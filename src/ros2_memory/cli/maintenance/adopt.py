@@ -32,7 +32,7 @@ def adopt(
     programs. From then on retention counts them in its budget and deletes them by its limits, and
     `forget` deletes them too. adopt itself deletes and changes nothing.
     """
-    settings, _ = load_for(bag_dir, sets)
+    settings = load_for(bag_dir, sets)
     require_recorder(settings)
     root = settings.recording.bag_dir
     own = OwnRecordings(root)

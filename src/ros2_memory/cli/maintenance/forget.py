@@ -102,7 +102,7 @@ def forget(
     records.
     """
     with lines_as_json(as_json, is_answered=yes or dry_run):
-        settings, _ = load_for(bag_dir, overrides)
+        settings = load_for(bag_dir, overrides)
         require_recorder(settings)
         if not times.are_bounded:
             raise InvalidArgumentsError(f"give a time window: {BOUNDED}")

@@ -62,7 +62,7 @@ def index(
     """
     keep_freed()
     gc.set_threshold(*_RARELY)
-    settings, _ = load_given(bag_dir, words)
+    settings = load_given(bag_dir, words)
     # Filling reads the columns of ten minutes together: small caches do.
     cache_mb = min(_CACHE_MB, settings.store.cache_mb)
     reader = replace(settings.reader, chunk_cache_mb=cache_mb)

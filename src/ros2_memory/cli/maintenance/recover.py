@@ -23,7 +23,6 @@ from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArguments
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
-from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.repair import Repaired, Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S
@@ -170,18 +169,10 @@ def is_foreign(folder: Path) -> bool:
 def _correct_metadata(folder: Path, repairer: Repairer) -> str | None:
     """Makes metadata.yaml describe the files of a recording; returns a line if something is new."""
     path = folder / METADATA_FILE
-    existed = size_of(path) > 0
     try:
-        if repairer.correct_metadata(folder):
-            return f"{path}: {'rewritten' if existed else 'written'} to match the files"
+        return f"{path}: made to match the files" if repairer.correct_metadata(folder) else None
     except (BagError, OSError, ValueError) as error:
         return f"{path} NOT CORRECTED: {error}"
-    if existed or not any(folder.glob(f"*{_MCAP}")):
-        return None
-    return (
-        f"{folder} has no {METADATA_FILE}, and none is written, since its files are not named "
-        f"after it as {folder.name}_0{_MCAP}: `ros2 bag reindex {folder}` makes one"
-    )
 
 
 def _require_unused(

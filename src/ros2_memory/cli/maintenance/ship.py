@@ -52,7 +52,7 @@ def ship(
     It can be killed and started again at any time: each bag comes into the lake once. Needs
     ros2-memory[lake].
     """
-    settings, _ = load_for(None, overrides)
+    settings = load_for(None, overrides)
     window = _window_to_forget(forget, times)
     share_one_arena()
     location, shared = lake_location(settings), shared_parts(settings)
@@ -253,7 +253,7 @@ class _ShippingService:
         `fleet.robots` may be a pattern, which matches more folders than before.
         """
         try:
-            settings, _ = load_for(None, self.overrides)
+            settings = load_for(None, self.overrides)
             fleet, names = settings.fleet, {robot.name for robot in self.robots}
             new = {name: bags for name, bags in fleet.robots.items() if name not in names}
             if not new:
