@@ -44,7 +44,6 @@ from pydantic_core import to_jsonable_python
 from ros2_memory.config_errors import (
     OpenSecretError,
     foreign_errors_as_config_error,
-    line_of,
     validated,
 )
 from ros2_memory.config_sources import (
@@ -860,9 +859,8 @@ def _load_file(model: type[_T], settings: Settings, key: str) -> _T:
     """Returns the content of the YAML file that a key of the settings names, as a model."""
     path: Path = attrgetter(key)(settings)
 
-    def source(fault: str) -> str:
-        line = line_of(path, fault)
-        return f"in {path}{f', line {line}' if line else ''}, which {key} names"
+    def source(_: str) -> str:
+        return f"in {path}, which {key} names"
 
     with foreign_errors_as_config_error(f"{key}: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)

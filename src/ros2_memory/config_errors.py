@@ -7,11 +7,10 @@ and the file system raise is translated in one place.
 from __future__ import annotations
 
 import re
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_origin, get_type_hints
 
-import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
@@ -103,25 +102,6 @@ def foreign_errors_as_config_error(where: str, source: Callable[[str], str]) -> 
         reason = _reason_of(error)
         sentence = f"{key}: {reason} (set {source(key)})" if key else f"{where}: {reason}"
         raise ConfigError(sentence) from error
-
-
-def line_of(path: Path, key: str) -> int | None:
-    """Returns the line (from 1) of a dot-path's key in a YAML file, or of the nearest key above it.
-
-    None if the file has none of these keys, or cannot be read.
-    """
-    line, rest = None, f"{key}."
-    with suppress(OSError, ValueError, YAMLError, RecursionError):
-        node = yaml.compose(path.read_text(encoding="utf-8"), yaml.SafeLoader)
-        while isinstance(node, yaml.MappingNode):
-            # The name of a key may have dots itself.
-            leading = (entry for entry in node.value if rest.startswith(f"{entry[0].value}."))
-            entry = next(leading, None)
-            if entry is None:
-                break
-            name, node = entry
-            line, rest = name.start_mark.line + 1, rest.removeprefix(f"{name.value}.")
-    return line
 
 
 def _reason_of(error: Exception) -> str:

@@ -200,13 +200,9 @@ def _parse_override(text: str, source: str, options: Mapping[str, Sequence[str]]
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
-        is_cut = text.count("[") != text.count("]") or text.count("{") != text.count("}")
-        spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
-        is_path = "/" in text and "=" not in text
-        folder = f" (a folder of bags: recording.bag_dir={text})" if is_path else ""
         raise ConfigError(
             f"{shown} is not a setting (given {source}); write key=value, such as "
-            f"server.port=9300{folder}, and key='value' where special characters are in it{spaces}"
+            "server.port=9300, and \"key='value'\" where spaces or special characters are in it"
         ) from (None if is_secret else error)
     key = override.key_or_group
     if not key or override.is_sweep_override():

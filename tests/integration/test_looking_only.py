@@ -30,7 +30,7 @@ COMMANDS = {
     "topics": ["topics"],
     "ask": ["ask", "list_recorded_topics"],
     "ask a search": ["ask", "find_last_match", "topic=/odom", "condition_type=contains", "value=x"],
-    "ask for a moment": ["ask", "remember_moment", "label=x", "--set", "server.write_tools=true"],
+    "ask for a moment": ["ask", "remember_moment", "label=x", "server.write_tools=true"],
     "doctor": ["doctor"],
     "watch": ["watch", "--count", "2", "--every", "0.1"],
     "index": ["index"],

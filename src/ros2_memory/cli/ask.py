@@ -16,11 +16,9 @@ from ros2_memory.cli.options import (
     AsJson,
     BagDir,
     Recording,
-    Sets,
     Verbose,
     is_folder,
     load_to_look,
-    newest_day,
     open_memory,
     parse_duration,
     parse_time,
@@ -40,12 +38,11 @@ from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Reply
 
 _SETTING: Final = re.compile(
-    r"\+{0,2}((recording|data|reader|retention|server|fleet|lake|logging)\.\w"
+    r"\+{0,2}((recording|data|reader|store|retention|memory|server|fleet|lake|logging)\.\w"
     r"|(deployment|storage|recorder|lake)=).*",
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""
-_TIMES_OF_RECAP: Final = ("last_s", "start", "end", "around")
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
 
@@ -76,7 +73,6 @@ def ask(
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     recording: Recording = None,
-    settings: Sets = None,
     verbose: Verbose = False,
     tool_help: Annotated[bool, typer.Option(TOOL_HELP, hidden=True)] = False,
 ) -> bool:
@@ -89,7 +85,7 @@ def ask(
     if tool is not None and tool_help:
         _print_help(tool)
         return False
-    question, looking = [], [*(settings or ())]
+    question, looking = list[str](), list[str]()
     for word in [tool, *(given or ())]:
         if word is None:
             continue
@@ -145,8 +141,7 @@ def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:
 def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence[str]) -> Reply:
     """Returns the reply of a tool, asked with words of the command line, and stops the dispatcher.
 
-    Times and durations may be written as people write them. A `recap` without a time is that of
-    the newest day.
+    Times and durations may be written as people write them.
 
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
@@ -158,9 +153,6 @@ def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence
         key: _with_parsed_times(value, schemas.get(key), now)
         for key, value in parse_arguments(words, schemas).items()
     }
-    if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
-        first, last = newest_day(memory).asked()
-        arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
     return call_once(dispatcher, name, arguments)
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from enum import IntEnum
 from functools import partial
-from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
@@ -21,7 +20,7 @@ from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
 from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reason_of
 from ros2_memory.cli.output import escape, format_size, print_json, print_line, spinner
-from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
+from ros2_memory.config import NullRecorderNode, Settings, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
@@ -43,7 +42,7 @@ from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.installation import advice_on_rmw, rmw_of, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.results import DataTimeRange
-from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
+from ros2_memory.retention.policy import GB
 from ros2_memory.serving.auth import api_token
 from ros2_memory.serving.health import read_health
 from ros2_memory.storage.base import Closing
@@ -187,7 +186,7 @@ def _examine_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Fin
 
 
 def check_bag_dir(robot: Examined) -> Iterator[Finding]:
-    """Checks that the bag directory exists, and that this user may use it."""
+    """Checks that the bag directory exists, and that this user may read it."""
     bag_dir = robot.settings.recording.bag_dir.absolute()
     if not bag_dir.is_dir() and robot.records:
         do = "the recorder makes it when it starts; is its disk mounted?"
@@ -197,14 +196,8 @@ def check_bag_dir(robot: Examined) -> Iterator[Finding]:
         yield error(f"{bag_dir} is not a directory", do)
     elif not os.access(bag_dir, os.R_OK | os.X_OK):
         yield error(f"this user may not read {bag_dir}", _READ)
-    elif robot.records and not os.access(bag_dir, os.W_OK):
-        do = (
-            "fine if the recorder runs as another user, who may: "
-            "sudo -u USER ros2-memory doctor looks as that one"
-        )
-        yield warning(f"{bag_dir}, readable but not writable by this user", do)
     else:
-        yield ok(f"{bag_dir}, readable{' and writable' if robot.records else ''}")
+        yield ok(f"{bag_dir}, readable")
     if (bag_dir / ERASING_FILE).exists():
         yield warning(
             "an earlier `ros2-memory forget` was interrupted: some data to delete is still there",
@@ -235,9 +228,6 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
         yield ok(seen)
     if leaving := describe_leaving(robot.memory.index.bag_dir):
         yield warning(leaving, "memory.keep=true keeps it")
-    if limits.max_total_gb < SMALL_BUDGET_GB:
-        do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
-        yield warning(small_budget(limits.max_total_gb), do)
 
 
 def check_clock(robot: Examined) -> Iterator[Finding]:
@@ -473,22 +463,18 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
 
 
 def check_topics(robot: Examined) -> Iterator[Finding]:
-    """Checks that each entry of `topics.yaml` has been recorded, or is received."""
-    file, live = _topics_file(robot.settings), robot.live
-    recorded = robot.snapshot.timeline.topics()
+    """Checks that each entry of the recorder's list has been recorded, or is received."""
+    recorded, live = robot.snapshot.timeline.topics(), robot.live
+    heartbeat = read_heartbeat(robot.settings.recording.bag_dir).heartbeat
     try:
-        selection = load_topics(file)
+        selection = load_topics(robot.settings.recording.topics_file)
     except EpisodicError as problem:
         yield error(str(problem), "correct recording.topics_file")
         return
-    if live is not None and live.listed and {*live.listed} != {*selection.listed}:
-        others = {*live.listed} ^ {*selection.listed}
-        yield warning(
-            f"the running recorder has another list than {file}: {listed(sorted(others))}",
-            "a changed list is taken within seconds; if the recorder has another file, give this "
-            "command its settings (its environment and key=value arguments)",
+    if heartbeat is not None and heartbeat.listed:  # the list that it has in use
+        selection = TopicSelection(
+            tuple(line for line in heartbeat.listed if not line.startswith("not "))
         )
-        return
     for glob in robot.settings.retention.topics:
         if not (selection.matches(glob) or match_topics((*selection.entries, *recorded), glob)):
             seen = f"{glob} in retention.topics is no topic that is recorded"
@@ -501,21 +487,13 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     ]
     if not robot.snapshot.bags or not missing:
         so_far = "all are recorded" if robot.snapshot.bags else "nothing is recorded yet"
-        yield ok(f"{file} lists {counted(len(selection.entries), 'entry', 'entries')}; {so_far}")
+        yield ok(f"{counted(len(selection.entries), 'entry', 'entries')} in the list; {so_far}")
         return
     for entry in missing:
         near = similar(entry, recorded, 2)
         hint = f"is it {' or '.join(near)}? " if near else ""
         do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
-        yield warning(f"{entry} is in {file}, and was never recorded", f"{hint}{do}")
-
-
-def _topics_file(settings: Settings) -> Path:
-    """Returns the list of topics in use: if none was chosen, the one that `up` wrote."""
-    chosen = settings.recording.topics_file
-    written = settings.recording.bag_dir / chosen.name
-    is_shipped = chosen.absolute() == (config_dir(os.environ) / chosen.name).absolute()
-    return written if is_shipped and written.is_file() else chosen
+        yield warning(f"{entry} is in the list of topics, and was never recorded", f"{hint}{do}")
 
 
 def check_server(settings: Settings) -> Iterator[Finding]:

@@ -151,8 +151,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif is_empty:
         _print_nothing(memory)
     else:
-        lists: JsonObject = {"recordings": [*rows], "not_read": [*not_read]}
-        print_reply({title: entries for title, entries in lists.items() if entries})
+        print_reply({"recordings": [*rows], "not_read": [*not_read]})
     return is_empty
 
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, is_dataclass, replace
-from datetime import datetime, time, timedelta
+from datetime import datetime, timedelta
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from io import StringIO
@@ -34,7 +34,6 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
     WallClock,
-    ns_from_unix,
     require_no_date,
     unix_from_ns,
     unix_from_text,
@@ -59,7 +58,7 @@ TIMES: Final = (
     "yesterday 14:05, now, or how long ago (90s, 10m, 2h, 3d)"
 )
 _AGO: Final = re.compile(
-    r"(\d+(?:\.\d+)?) ?([smhd]|sec|seconds?|min|minutes?|hours?|days?)(?: ago)?"
+    r"(\d+(?:\.\d+)?) ?([smhd]|sec|seconds?|min|minutes?|hours?|days?)?(?: ago)?"
 )
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _LARGEST_UNIX_S: Final = 1e11
@@ -93,26 +92,6 @@ LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings to read bags of other programs: of any kind, and "ago" counts from the newest data."""
 
 AsJson = Annotated[bool, "--json", "Print JSON."]
-
-
-def _parse_seconds(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        seconds = parse_duration(text)
-    if seconds is None:
-        raise typer.BadParameter(f"{text!r} is neither seconds nor a duration such as 90s, 10m, 2h")
-    return seconds
-
-
-Last = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        parser=_parse_seconds,
-        help="The last S seconds, or 10m, 2h, 3d; instead of --start and --end.",
-    ),
-]
 
 
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
@@ -324,12 +303,12 @@ def present_time(memory: "Memory") -> Ns:
 
 
 def parse_duration(text: str) -> float | None:
-    """Returns the seconds of a text such as `90s`, `10m`, `2h` or `3d`; None of any other."""
+    """Returns the seconds of a text such as `90`, `90s`, `10m`, `2h` or `3d`; None of any other."""
     match = _AGO.fullmatch(text.strip().lower())
     if match is None:
         return None
     number, unit = match.groups()
-    return float(number) * _SECONDS_OF[unit[0]]
+    return float(number) * _SECONDS_OF[unit[0] if unit else "s"]
 
 
 def parse_time(text: str, now: float) -> float:
@@ -376,16 +355,6 @@ def with_date(text: str, now: float) -> str:
     return f"{date}T{time_of_day}" if time_of_day else date.isoformat()
 
 
-def newest_day(memory: "Memory") -> TimeWindow:
-    """Returns the local day of the newest data, from midnight to midnight."""
-    newest = memory.index.snapshot().dating.latest
-    at_s = unix_from_ns(memory.clock.now() if newest is None else newest)
-    date = datetime.fromtimestamp(at_s).astimezone().date()
-    days = (date, date + timedelta(days=1))
-    begin_s, end_s = (datetime.combine(day, time.min).timestamp() for day in days)
-    return TimeWindow(ns_from_unix(begin_s), ns_from_unix(end_s))
-
-
 @dataclass(frozen=True, kw_only=True)
 class Bags:
     """The options of a command that looks at bags."""
@@ -410,7 +379,9 @@ class Times:
 
     start: Annotated[str | None, "TIME", f"Start time: {TIMES}; local time."] = None
     end: Annotated[str | None, "TIME", "End time, inclusive, in the same formats."] = None
-    last: Last = None
+    last: Annotated[
+        str | None, "S", "The last S seconds, or 10m, 2h, 3d; instead of --start and --end."
+    ] = None
 
     @property
     def are_bounded(self) -> bool:
@@ -434,11 +405,12 @@ class Times:
         if self.last is not None:
             if self.start is not None or self.end is not None:
                 raise InvalidArgumentsError("give --last, or --start and --end, not both")
-            if not self.last > 0:
+            last_s = parse_duration(self.last)
+            if last_s is None or not last_s > 0:
                 raise InvalidArgumentsError(
-                    f"--last is {self.last:g}; it must be more than 0 seconds"
+                    f"--last is {self.last}; it must be more than 0 seconds, or 90s, 10m, 2h, 3d"
                 )
-            return TimeWindow.from_unix(now - self.last, now)
+            return TimeWindow.from_unix(now - last_s, now)
         start_s, end_s = unix_from_ns(MIN_NS), unix_from_ns(MAX_NS)
         if self.start is not None:
             start_s = parse_time(self.start, now)

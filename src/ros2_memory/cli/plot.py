@@ -4,9 +4,7 @@ Times are Unix seconds. No window is opened, and nothing is written but the pict
 matplotlib keeps in its own folders, its list of fonts.
 """
 
-import logging
 import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,16 +19,16 @@ from numpy.typing import NDArray
 from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.cat import extract_values
-from ros2_memory.cli.options import AsJson, Bags, Times, as_command, newest_day
+from ros2_memory.cli.options import AsJson, Bags, Times, as_command
 from ros2_memory.cli.output import atomic_file, print_json, print_line, print_notes, spinner
 from ros2_memory.core.arrays import Ints
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import recording_gaps
+from ros2_memory.history.coverage import note_unread, recording_gaps
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View, open_view
@@ -51,10 +49,8 @@ _MOST_SAMPLES: Final = 20_000
 _PERIODS: Final = 5
 """A step of a signal that is longer than so many usual ones, and than a second, is a gap."""
 _STYLE: Final = {
-    "axes.axisbelow": True,
     "axes.grid": True,
     "font.size": 9,
-    "svg.hashsalt": "ros2-memory",
     "text.parse_math": False,  # or a dollar sign in a name would begin a formula
 }
 _DAY_S: Final = 86_400
@@ -98,10 +94,8 @@ class Picture(Bags, Times):
     ]
     as_json: AsJson = False
 
-    def open_window(self, *, newest_day_by_default: bool = False) -> PlotWindow:
-        """Opens the memory at the window of the options.
-
-        Without one of --start, --end and --last that is the whole memory, or its newest day.
+    def open_window(self, times: Times | None = None) -> PlotWindow:
+        """Opens the memory at the window of the options, or at another one.
 
         Raises:
             ConfigError: matplotlib is not installed.
@@ -114,10 +108,7 @@ class Picture(Bags, Times):
                 f"--out {self.out} is not a picture: its name must end in {', '.join(FORMATS)}"
             )
         memory = self.memory()
-        has_times = self.start is not None or self.end is not None or self.last is not None
-        if newest_day_by_default and not has_times:
-            return recorded_part(memory, newest_day(memory))
-        return recorded_part(memory, self.window(memory))
+        return recorded_part(memory, (times or self).window(memory))
 
     @contextmanager
     def figure(
@@ -130,20 +121,15 @@ class Picture(Bags, Times):
         Raises:
             OSError: the file cannot be written.
         """
-        # matplotlib warns of fonts, of its own limits, and if it cannot store its list of fonts.
-        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         start, end = (datetime.fromtimestamp(at).astimezone() for at in shown.span)
-        kind = self.out.suffix[1:].lower()
-        with rc_context(_STYLE), warnings.catch_warnings(), atomic_file(self.out) as temporary:
-            warnings.simplefilter("ignore")  # about letters that no font here has
+        with rc_context(_STYLE), atomic_file(self.out) as temporary:
             figure = Figure(figsize=(9.0, height), layout="constrained")
             figure.suptitle(f"{title}, {start:%Y-%m-%d %H:%M:%S} - {end:%Y-%m-%d %H:%M:%S %Z}")
             yield figure
-            metadata = {"Date": None} if kind == "svg" else None
-            figure.savefig(temporary, format=kind, dpi=130, metadata=metadata)
+            figure.savefig(temporary, format=self.out.suffix[1:].lower(), dpi=130)
         if self.as_json:
             print_json({"path": str(self.out), "notes": [*notes]})
         else:
@@ -154,16 +140,16 @@ class Picture(Bags, Times):
 @plot.command("path", epilog=epilog("plot"))
 @as_command("plot path")
 def plot_path(*, picture: Picture) -> None:
-    """Draw the driven path in 2D, with named places and standstills.
+    """Draw the driven path in 2D, with named places.
 
     Another topic of poses is chosen by data.pose_topic=TOPIC, a frame by data.map_frame=FRAME.
     """
     shown = picture.open_window()
     with spinner("looking for the path"):
         frame, line = _path_in(shown)
-        summary = shown.recap()
-    with picture.figure("Path", shown, summary.notes) as figure:
-        _draw_path(figure.add_subplot(), shown, frame, line, summary)
+        note_unread(shown.view, shown.window)
+    with picture.figure("Path", shown, [*shown.view.notes.sentences()]) as figure:
+        _draw_path(figure.add_subplot(), shown, frame, line)
 
 
 @plot.command("signal", epilog=epilog("plot"))
@@ -207,9 +193,10 @@ def plot_timeline(*, picture: Picture) -> None:
 def plot_recap(*, picture: Picture) -> None:
     """Draw a day in one picture: where the robot drove, what happened, what was recorded.
 
-    Without a time it is the newest day; --start yesterday --end yesterday is the one before today.
+    Without a time it is today; --start yesterday --end yesterday is the day before.
     """
-    shown = picture.open_window(newest_day_by_default=True)
+    has_times = any((picture.start, picture.end, picture.last))
+    shown = picture.open_window(None if has_times else Times(start="today", end="today"))
     with spinner("recalling the day"):
         summary = shown.recap()
         rows = event_rows(shown, summary)
@@ -218,7 +205,7 @@ def plot_recap(*, picture: Picture) -> None:
         plane, timeline = figure.subplots(2, 1, height_ratios=[6.0, height])
         plane.set_axis_off()
         with suppress(InvalidArgumentsError, NoDataError):  # a day without a path is drawn, too
-            _draw_path(plane, shown, *_path_in(shown), summary)
+            _draw_path(plane, shown, *_path_in(shown))
             plane.set_axis_on()
         _draw_rows(timeline, rows, shown.span)
 
@@ -249,8 +236,8 @@ def _path_in(shown: PlotWindow) -> tuple[str, Line]:
     return path.frame, line
 
 
-def _draw_path(axes: "Axes", shown: PlotWindow, frame: str, line: Line, summary: Recap) -> None:
-    """Draws a path, with the named places and standstills of its frame."""
+def _draw_path(axes: "Axes", shown: PlotWindow, frame: str, line: Line) -> None:
+    """Draws a path, with the named places of its frame."""
     for place in shown.view.limits.places:
         if place.frame_id == frame:
             left, right, low, high = place.region.bounds
@@ -261,9 +248,6 @@ def _draw_path(axes: "Axes", shown: PlotWindow, frame: str, line: Line, summary:
     axes.plot(x, y, linewidth=1.5, marker=".", markersize=2)
     axes.scatter(line.x[0], line.y[0], s=60, marker="o", color="C2", zorder=3, label="start")
     axes.scatter(line.x[-1], line.y[-1], s=60, marker="s", color="C3", zorder=3, label="end")
-    stops = [event.point for event in summary.events if event.kind == "stop" and event.point]
-    if stops and summary.frame_id == frame:
-        axes.scatter(*np.array(stops).T, s=60, color="C1", alpha=0.55, label="stood")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"x (m, {frame})")
     axes.set_ylabel("y (m)")
@@ -308,12 +292,9 @@ def read_signals(
     times: list[Ns] = []
     rows: list[list[float]] = []
     for time, value in extract_values(shown.view, picked, fields, exact=True):
-        values = value if isinstance(value, dict) else {}
-        numbers = (values.get(field) for field in fields)
+        cells = value if isinstance(value, dict) else {}
         times.append(time)
-        rows.append(
-            [number if isinstance(number, bool | int | float) else math.nan for number in numbers]
-        )
+        rows.append([_number(cells.get(field)) for field in fields])
     notes = [*shown.view.notes.sentences()]
     if total > len(rows):
         notes.append(f"{len(rows)} of {total} messages are drawn, evenly spaced")
@@ -324,6 +305,10 @@ def read_signals(
         raise InvalidArgumentsError(f"{listed(without_number)} holds no number in this time")
     at = np.array(times)
     return {field: _broken_at_gaps(at, values) for field, values in signals.items()}, notes
+
+
+def _number(value: JsonValue) -> float:
+    return float(value) if isinstance(value, bool | int | float) else math.nan
 
 
 def _broken_at_gaps(times: Ints, values: Floats) -> Signal:

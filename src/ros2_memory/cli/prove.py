@@ -79,9 +79,9 @@ def prove(
     read, parts, definitions = log.spans(), _parts_without_gaps(view), Definitions(memory.reader)
     own_settings = [word for word in bags.words or () if not is_folder(word)]
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
-        everything = {topic: [(MIN_NS, MAX_NS)] for topic in view.timeline.topics()}
-        for name, spans in (("read", _read_and_ends(view, read, parts)), ("all", everything)):
-            path = Path(folder) / name / output.name
+        attempts = _spans_to_copy(view, read, parts, in_one_file=output.suffix == ".mcap")
+        for number, spans in enumerate(attempts):
+            path = Path(folder) / str(number) / output.name
             path.parent.mkdir()
             count = _write_copy(path, view, spans, parts, definitions)
             copied = load_to_look(None, [str(path), *looking, *own_settings])
@@ -185,15 +185,23 @@ def _parts_without_gaps(view: View) -> list[_Part]:
     ]
 
 
-def _read_and_ends(
-    view: View, read: Mapping[str, Spans], parts: Sequence[_Part]
-) -> dict[str, Spans]:
-    """Returns the times of each topic that were read, and of all topics the ends of each part.
+def _spans_to_copy(
+    view: View, read: Mapping[str, Spans], parts: Sequence[_Part], *, in_one_file: bool
+) -> list[dict[str, Spans]]:
+    """Returns the times of each topic to copy: those that were read; else all of them.
 
-    The first and the last message of a part say from when to when something was recorded.
+    All topics are copied at the ends of each part, which say from when to when something was
+    recorded.
     """
-    ends = [(at, at + 1) for part in parts for at in (part.window.start, part.window.stop - 1)]
-    return {topic: united([*read.get(topic, ()), *ends]) for topic in view.timeline.topics()}
+    topics = view.timeline.topics()
+    ends = sorted(at for part in parts for at in (part.window.start, part.window.stop - 1))
+    if in_one_file:  # there is nothing between recordings
+        ends = [ends[0], ends[-1]]
+    moments = [(at, at + 1) for at in ends]
+    return [
+        {topic: united([*read.get(topic, ()), *moments]) for topic in topics},
+        {topic: [(MIN_NS, MAX_NS)] for topic in topics},
+    ]
 
 
 def _write_copy(

@@ -60,7 +60,7 @@ def test_the_file_alone_gives_the_answer(
     *words, last = shlex.split(command)
     assert (" ".join(words), last) == (question, str(proof))
     code = 1 if "/nothing" in question else 0
-    asked = exits(code, "ask", *words, bags, "--json", "--set", "data.now=latest").json
+    asked = exits(code, "ask", *words, bags, "--json", "data.now=latest").json
     assert exits(code, "ask", *words, proof, "--json").json == asked
 
 

@@ -127,7 +127,7 @@ def recover_files(
         RecorderError: there is no such file or directory.
     """
     clock = clock or WallClock()
-    files, others = _files_below(path, clock)
+    files = _files_below(path, clock)
     repairer, opened, outcome = build_repairer(), open_files(), RecoveryOutcome()
     names = {file: str(file if file == path else file.relative_to(path)) for file in files}
     unfinished: list[Path] = []
@@ -152,9 +152,6 @@ def recover_files(
     for folder in folders:
         if line := _correct_metadata(folder, repairer):
             outcome.lines.append(line)
-    if others:
-        left = counted(others, "bag file of another kind was", "bag files of other kinds were")
-        outcome.lines.append(f"{left} left alone: only MCAP files are repaired")
     outcome.lines.append(outcome.summary())
     return outcome
 
@@ -208,8 +205,8 @@ def _require_unused(
         raise BagError(str(file), reason)
 
 
-def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
-    """Returns the MCAP files at or below a path, and the number of bags of other kinds there.
+def _files_below(path: Path, clock: Clock) -> list[Path]:
+    """Returns the MCAP files at or below a path.
 
     Raises:
         RecorderError: the path does not exist, is behind a symbolic link, or cannot be listed.
@@ -221,7 +218,7 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
             f"give the path itself: {path.resolve()}"
         )
     if path.is_file():
-        return [path], 0
+        return [path]
     if not path.is_dir():
         raise RecorderError(f"{path}: there is no such file or directory")
     tree = Tree(path).scan(clock.now(), ())
@@ -229,6 +226,5 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
         raise RecorderError(f"{path} cannot be listed: {tree.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
     links = HardLinks(path)
-    bags = sorted(Path(name) for name in tree.stamps if not links.is_saved(name))
-    files = [bag for bag in bags if bag.suffix == _MCAP]
-    return files, len(bags) - len(files)
+    bags = (Path(name) for name in tree.stamps if not links.is_saved(name))
+    return sorted(bag for bag in bags if bag.suffix == _MCAP)
