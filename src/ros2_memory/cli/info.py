@@ -100,14 +100,17 @@ def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
 
 
 def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
-    """Prints the values of a report that are known."""
+    """Prints the values of a report that are known, each once."""
     snapshot = memory.index.snapshot()
     files = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any(files):
         _print_nothing(memory)
         return
     values = {key: value for part in report.values() for key, value in leaves(part)}
-    print_reply({key: value for key, value in values.items() if value not in (None, [])})
+    for key, value in [*values.items()]:
+        if value in (None, []) or key.endswith("_local"):
+            del values[key]
+    print_reply(values)
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:

@@ -14,7 +14,6 @@ from io import StringIO
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Final
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -168,7 +167,7 @@ def _print_rows(rows: Sequence[JsonObject]) -> None:
             print_line("")
             _print_object(row)
         return
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for path in columns:
         table.add_column(Text(escape(path)), overflow="fold")
     for row in flat:

@@ -269,10 +269,7 @@ def _may_keep_memory(bags: Path, *, yes: bool) -> bool:
         return True
     if yes or not sys.stdin.isatty():
         return False
-    if typer.confirm(_KEEP_FOR_A_YEAR, default=False):
-        return True
-    print_line("no such memory is kept; with memory.keep=false `up` does not ask")
-    return False
+    return typer.confirm(_KEEP_FOR_A_YEAR, default=False)
 
 
 def _show_list(robot: _Robot, survey: Survey, disk: Disk) -> None:

@@ -29,7 +29,7 @@ def test_doctor_and_info_are_about_each_robot(robots: str, exits: Program) -> No
     told = exits(0, "info --json", robots).json
     assert {name: each["held"]["bags"] for name, each in told.items()} == {"r1": 2, "away": 0}
     shown = exits(0, "info", robots).out
-    assert shown.index("r1 ") < shown.index("messages") < shown.index("away ")
+    assert shown.index("r1\n") < shown.index("messages") < shown.index("away\n")
 
 
 def test_what_looks_at_one_robot_asks_which(robots: str, tmp_path: Path, exits: Program) -> None:

@@ -124,10 +124,12 @@ class _Forget:
 
     Attributes:
         leaves_some: whether something stays that was to go.
+        stays: lines on what stays, which are to be printed.
     """
 
     def __init__(self, settings: Settings, memory: Memory, *, dry_run: bool) -> None:
         self.leaves_some = False
+        self.stays: list[str] = []
         self._settings = settings
         self._memory = memory
         self._dry_run = dry_run
@@ -178,9 +180,7 @@ class _Forget:
         Raises:
             InvalidArgumentsError: no such place is named, or no topic matches.
         """
-        windows, unknown = [window], list[str]()
-        if place is not None:
-            windows, unknown = self._windows_in(place, window)
+        windows = [window] if place is None else self._windows_in(place, window)
         with spinner("looking which topics there are"):
             recorded = self._eraser.topics()
         latched = recorded.intersection(self._carrier.topics(self._memory.index.snapshot()))
@@ -195,23 +195,23 @@ class _Forget:
                     "latched messages stay, because they are valid later, too (name a topic to "
                     f"forget it): {listed(sorted(latched))}"
                 )
-        self._print_kept(unknown)
         latched &= topics
         if self._recorder is not None and latched:
             what = f"{listed(sorted(latched))}: latched messages, which the recorder carries on"
-            self._print_kept([f"{what}: {self._recorder}; stop the recorder, and forget again"])
+            self.stays.append(f"{what}: {self._recorder}; stop the recorder, and forget again")
             topics, latched = topics - latched, frozenset()
+        self._print_stays()
         return Erasure.of(topics, windows, latched)
 
-    def _windows_in(self, name: str, window: TimeWindow) -> tuple[list[TimeWindow], list[str]]:
-        """Returns when the robot was in a named place, and sentences on unknown times."""
+    def _windows_in(self, name: str, window: TimeWindow) -> list[TimeWindow]:
+        """Returns when the robot was in a named place; times when nobody knows stay."""
         with spinner(f"looking when the robot was in {name}"):
             view = open_view(self._memory, Call(), None)
             place = parse_where(self._memory.limits, name)
             stays = known_track_for(view, place, window).inside(place.region, window)
         around = (TimeWindow(stay.start, stay.stop + 1).widened(PLACE_MARGIN_NS) for stay in stays)
-        unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
-        return [time.intersect(window) for time in around], unknown
+        self.stays += [f"what is not known: {note}" for note in view.notes.sentences()]
+        return [time.intersect(window) for time in around]
 
     def erase(self, erasure: Erasure, *, asks: bool) -> None:
         """Takes messages out of bags, with `asks` after confirmation."""
@@ -219,7 +219,8 @@ class _Forget:
         if erasure.topics and erasure.windows:
             with spinner("looking which bags hold some"):
                 survey = self._eraser.survey(erasure)
-        self._print_kept(survey.kept)
+        self.stays += survey.kept
+        self._print_stays()
         if not survey.holders and not erasure.files:
             print_line("no such message is in the window")
             self._forget_derived(())
@@ -236,23 +237,26 @@ class _Forget:
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             if recorder is not None and self._recorder is None:
                 raise RecorderError(f"nothing was deleted: {recorder}; forget again")
-            kept_by_lake = self._request_of_lake(
+            self._request_of_lake(
                 [Forgetting(*window, erasure.topics) for window in erasure.windows]
             )
             result = self._eraser.erase(erasure, survey, self._forget_derived_of)
         is_all = not result.kept
         print_line(f"deleted: {counts.total()} messages" if is_all else "not all is deleted")
-        self._print_kept([*result.kept, *kept_by_lake])
+        self.stays += result.kept
+        self._print_stays()
         for note in result.notes:
             print_line(note)
 
     def delete_bags(self, window: TimeWindow, *, asks: bool) -> None:
         """Deletes the bags that lie inside a window, with `asks` after confirmation."""
-        bags, kept = self._plan_deletion(window)
-        self._print_kept([*kept, *self._copies_that_stay(bags, window)])
+        bags = self._plan_deletion(window)
+        has_reasons = bool(self.stays)
+        self.stays += self._copies_that_stay(bags, window)
+        self._print_stays()
         if not bags:
             why = "no closed bag has messages in the window"
-            if kept:
+            if has_reasons:
                 why = "each bag with messages in the window stays, for the reason above"
             print_line(f"nothing to delete: {why}")
             self._forget_derived(())
@@ -276,32 +280,32 @@ class _Forget:
             typer.confirm("Delete them? This cannot be undone.", abort=True)
         return not self._dry_run
 
-    def _print_kept(self, lines: Iterable[str]) -> None:
-        """Prints lines on what stays, and remembers that something does."""
-        for line in lines:
+    def _print_stays(self) -> None:
+        """Prints what stays, and remembers that something does."""
+        for line in self.stays:
             self.leaves_some = True
             print_line(f"{STAYS}{line}")
+        self.stays.clear()
 
-    def _plan_deletion(self, window: TimeWindow) -> tuple[list[BagFile], list[str]]:
-        """Returns the bags of a window that go, and a line with the reason for each that stays.
+    def _plan_deletion(self, window: TimeWindow) -> list[BagFile]:
+        """Returns the bags of a window that go.
 
         Reads only bags that have messages which do not count.
         """
         bags: list[BagFile] = []
-        kept: list[str] = []
         snapshot = self._memory.index.snapshot()
         for bag in self._bags_as_on_disk(snapshot):
             if not bag.reaches_into(window):
                 continue
             if reason := self._reason_to_keep(bag, window):
-                kept.append(f"{self._name(bag)}: {reason}")
+                self.stays.append(f"{self._name(bag)}: {reason}")
             else:
                 bags.append(bag)
         deleted_too = {other_form(bag.file) for bag in bags}
         for aside, reason in self._unread_in(window, snapshot):
             if str(aside.path) not in deleted_too:
-                kept.append(f"{self._name(aside)}: {reason}")
-        return bags, kept
+                self.stays.append(f"{self._name(aside)}: {reason}")
+        return bags
 
     def _unread_in(self, window: TimeWindow, snapshot: Snapshot) -> Iterator[tuple[SetAside, str]]:
         """Yields the files that are not read and may have messages in a window, each with why."""
@@ -386,75 +390,65 @@ class _Forget:
         """
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             snapshot = self._memory.index.refresh()
-            bags, kept = self._unchanged(planned, snapshot)
+            bags = self._unchanged(planned, snapshot)
             carried, paths = None, {bag.path for bag in bags}
             if recorder is None:
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
             else:  # it carries latched messages itself, and two programs must not do so at a time
                 latched = {bag.path for bag in self._carrier.with_latched(snapshot, paths)}
                 bags = [bag for bag in bags if bag.path not in latched]
-                kept += [
+                self.stays += [
                     f"{self._name(path)}: it has latched messages, which only the recorder may "
                     f"copy forward while it runs: {recorder}; stop the recorder, and forget again"
                     for path in sorted(latched)
                 ]
-            kept += self._ask_lake(bags)
-            kept += self._note_deletions(bags)
-            deleted, freed, failures = self._delete_files(bags)
-            kept += failures
+            self._ask_lake(bags)
+            self._note_deletions(bags)
+            deleted, freed = self._delete_files(bags)
             recordings = {bag.recording for bag in deleted}
-            kept += self._remove_emptied(recordings)
+            self._remove_emptied(recordings)
             try:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
-                kept.append(error.reason)
+                self.stays.append(error.reason)
             notes = correct_metadata_files(self._bag_dir, recordings, self._reader)
         also = ""
         if carried is not None:
             messages = counted(carried, "latched message is", "latched messages are")
             also = f"; {messages} carried on"
         print_line(f"deleted: {counted(len(deleted), 'bag')}, {format_size(freed)}{also}")
-        self._print_kept(kept)
+        self._print_stays()
         for note in notes:
             print_line(note)
 
-    def _unchanged(
-        self, planned: Sequence[BagFile], snapshot: Snapshot
-    ) -> tuple[list[BagFile], list[str]]:
-        """Returns the planned bags that are as they were, and a line on each that has changed.
-
-        A bag that is gone has no line: another program has deleted it meanwhile.
-        """
+    def _unchanged(self, planned: Sequence[BagFile], snapshot: Snapshot) -> list[BagFile]:
+        """Returns the planned bags that are as they were; others stay, or are gone meanwhile."""
         present = {_stamp(bag) for bag in self._bags_as_on_disk(snapshot)}
-        bags, changed = list[BagFile](), list[str]()
+        bags: list[BagFile] = []
         for bag in planned:
             is_own = self._own is None or self._own.owns_bag(bag.path)
             if _stamp(bag) in present and is_own:
                 bags.append(bag)
             elif bag.path.exists() or Path(other_form(bag.file)).exists():
-                changed.append(f"{self._name(bag)}: it has changed meanwhile; forget again")
-        return bags, changed
+                self.stays.append(f"{self._name(bag)}: it has changed meanwhile; forget again")
+        return bags
 
-    def _ask_lake(self, bags: Sequence[BagFile]) -> list[str]:
-        """Asks the lake to forget what it has of bags; returns a line on each thing that stays."""
-        requested, kept, times = list[ForgottenBag](), list[str](), list[Ns]()
+    def _ask_lake(self, bags: Sequence[BagFile]) -> None:
+        """Asks the lake to forget what it has of bags."""
+        requested, times = list[ForgottenBag](), list[Ns]()
         for bag in bags:
             if bag.path in self._unreadable:
-                kept.append(f"what a lake has of {self._name(bag)}, which cannot be read")
+                self.stays.append(f"what a lake has of {self._name(bag)}, which cannot be read")
                 continue
             start = bag.summary.start
             requested.append(ForgottenBag(bag.recording.name, bag.path.name, start))
             times += (start, bag.start, bag.end + 1)
         if requested:
             request = Forgetting(min(times), max(times), bags=tuple(requested))
-            kept += self._request_of_lake([request])
-        return kept
+            self._request_of_lake([request])
 
-    def _note_deletions(self, bags: Sequence[BagFile]) -> list[str]:
-        """Writes down what is about to be deleted, so that answers do not call it unrecorded.
-
-        Returns a line if that fails.
-        """
+    def _note_deletions(self, bags: Sequence[BagFile]) -> None:
+        """Writes down what is about to be deleted, so that answers do not call it unrecorded."""
         splits: dict[Path, list[tuple[str, Ns, Ns]]] = {}
         for bag in bags:
             split = bare_name(bag.path.name), bag.start, bag.end
@@ -463,15 +457,11 @@ class _Forget:
         try:
             append_deleted(self._bag_dir, deleted)
         except OSError as error:
-            return [f"the list of deleted bags: {error.strerror or error}"]
-        return []
+            self.stays.append(f"the list of deleted bags: {error.strerror or error}")
 
-    def _delete_files(self, bags: Sequence[BagFile]) -> tuple[list[BagFile], int, list[str]]:
-        """Deletes bags, plain and compressed.
-
-        Returns the bags that are gone, the bytes that were freed, and a line for each failure.
-        """
-        staying, freed, failures = set[Path](), 0, list[str]()
+    def _delete_files(self, bags: Sequence[BagFile]) -> tuple[list[BagFile], int]:
+        """Deletes bags, plain and compressed; returns those that are gone, and the bytes freed."""
+        staying, freed = set[Path](), 0
         for bag in bags:
             for path in (bag.path, Path(other_form(bag.file))):
                 try:
@@ -480,39 +470,36 @@ class _Forget:
                 except FileNotFoundError:
                     continue
                 except OSError as error:
-                    failures.append(f"{self._name(path)}: {error.strerror or error}")
+                    self.stays.append(f"{self._name(path)}: {error.strerror or error}")
                     staying.add(path)
-        return [bag for bag in bags if bag.path not in staying], freed, failures
+        return [bag for bag in bags if bag.path not in staying], freed
 
-    def _remove_emptied(self, recordings: Iterable[Path]) -> list[str]:
-        """Removes the folders of recordings without bags; returns a line for each failure."""
-        failures = []
+    def _remove_emptied(self, recordings: Iterable[Path]) -> None:
+        """Removes the folders of recordings without bags."""
         open_recordings = read_heartbeat(self._bag_dir).recordings
         for recording in {*recordings} - {self._bag_dir / name for name in open_recordings}:
             try:
                 remove_emptied(self._bag_dir, recording)
             except OSError as error:
-                failures.append(f"{self._name(recording)}: {error.strerror or error}")
-        return failures
+                self.stays.append(f"{self._name(recording)}: {error.strerror or error}")
 
-    def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> list[str]:
-        """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
+    def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> None:
+        """Stores what a lake has to forget."""
         if not forgettings:
-            return []
+            return
         try:
             FORGOTTEN.append(self._bag_dir, forgettings)
         except OSError as error:
             first_s = min(forgetting.start for forgetting in forgettings) // NS_PER_S
             last_s = -(-max(forgetting.stop for forgetting in forgettings) // NS_PER_S)
-            line = (
+            self.stays.append(
                 f"what a lake has of it: {self._bag_dir / FORGOTTEN_FILE} cannot be written "
                 f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
                 f"--forget ROBOT --start {first_s} --end {last_s}` where that is done"
             )
-            return [line]
+            return
         if (self._bag_dir / SHIPPED_FILE).exists():
             print_line("the next pass of ros2-memory ship deletes it from the lake, too")
-        return []
 
     def _forget_derived_of(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
