@@ -217,7 +217,8 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     seen = f"{free_gb:.1f} GB free in {existing}; used: {format_size(budget.used)} of "
     seen += f"{limits.max_total_gb:g} GB (retention.max_total_gb)"
     if budget.foreign:
-        seen += f"; {format_size(budget.foreign)} more by bags that `ros2-memory adopt` would count"
+        seen += f"; bags that the recorder did not make take {format_size(budget.foreign)} more, "
+        seen += "which is not counted: `ros2-memory adopt DIR` takes those of a folder"
     if free_gb < limits.min_free_gb:
         limit = f"retention.min_free_gb={limits.min_free_gb:g}"
         yield error(seen, f"recording pauses below {limit}; delete other files on this disk")
