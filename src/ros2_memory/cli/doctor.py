@@ -14,17 +14,18 @@ from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import ERASING_FILE
-from ros2_memory.bag_dir.state_files import describe_leaving
+from ros2_memory.bag_dir.layout import ERASING_FILE, MOMENTS_FOLDER, is_carried
+from ros2_memory.bag_dir.state_files import describe_leaving, is_shipped, read_receipts
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
 from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reason_of
 from ros2_memory.cli.output import escape, format_size, print_json, print_line, spinner
+from ros2_memory.columns.store import relative
 from ros2_memory.config import NullRecorderNode, Settings, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
-from ros2_memory.core.model import SetAside
+from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
-from ros2_memory.core.timebase import FUTURE_NS, Ns, iso_local, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.no_data import nothing_here
@@ -55,6 +56,8 @@ _WAIT: Final = (
     "it counts as being written; if no program writes it, as a copy, it is read once it is older"
 )
 _CORRECT: Final = "correct the key that it names"
+_LATE_NS: Final[Ns] = NS_PER_HOUR
+"""A hub that is reached has confirmed closed bags after this time."""
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 
 
@@ -186,7 +189,7 @@ def _examine_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Fin
 
 
 def check_bag_dir(robot: Examined) -> Iterator[Finding]:
-    """Checks that the bag directory exists, and that this user may read it."""
+    """Checks that the bag directory exists, and that this user may use it."""
     bag_dir = robot.settings.recording.bag_dir.absolute()
     if not bag_dir.is_dir() and robot.records:
         do = "the recorder makes it when it starts; is its disk mounted?"
@@ -196,8 +199,11 @@ def check_bag_dir(robot: Examined) -> Iterator[Finding]:
         yield error(f"{bag_dir} is not a directory", do)
     elif not os.access(bag_dir, os.R_OK | os.X_OK):
         yield error(f"this user may not read {bag_dir}", _READ)
+    elif robot.records and not os.access(bag_dir, os.W_OK):
+        do = "fine if another user records, who may: sudo -u USER ros2-memory doctor looks as that"
+        yield warning(f"{bag_dir}, readable but not writable by this user", do)
     else:
-        yield ok(f"{bag_dir}, readable")
+        yield ok(f"{bag_dir}, readable{' and writable' if robot.records else ''}")
     if (bag_dir / ERASING_FILE).exists():
         yield warning(
             "an earlier `ros2-memory forget` was interrupted: some data to delete is still there",
@@ -422,6 +428,36 @@ def _check_last_error_of(heartbeat: Heartbeat) -> Iterator[Finding]:
         yield warning(seen, "see its log")
 
 
+def check_shipping(robot: Examined) -> Iterator[Finding]:
+    """Checks that bags are shipped, if age deletes only shipped ones (`require_shipped`)."""
+    if not robot.settings.retention.require_shipped:
+        return
+    bag_dir = robot.settings.recording.bag_dir
+    receipts = read_receipts(bag_dir)
+    closed: list[BagFile] = []
+    waiting: list[BagFile] = []
+    for bag in robot.snapshot.bags:
+        name = relative(bag.file, str(bag_dir))
+        is_moment = name.startswith(f"{MOMENTS_FOLDER}/")
+        if bag.state is not BagState.CLOSED or is_carried(bag.path) or is_moment:
+            continue
+        closed.append(bag)
+        if not is_shipped(receipts, name, bag.size):
+            waiting.append(bag)
+    newest = max((receipt.at for receipt in receipts.values()), default=None)
+    seen = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
+    if newest is None:
+        seen += ", and there is no receipt: no bag is deleted for its age"
+    else:
+        seen += f"; the newest receipt is from {iso_local(newest)}"
+    late = robot.now - _LATE_NS
+    if any(bag.end < late for bag in waiting) and (newest or 0) < late:
+        do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
+        yield warning(seen, do)
+    else:
+        yield ok(seen)
+
+
 def check_lake(settings: Settings) -> Iterator[Finding]:
     """Checks that the lake is reached."""
     if settings.lake.warehouse is None:
@@ -539,6 +575,7 @@ _OF_BAGS: Final = {
 _OF_RECORDER: Final = {
     "ros": check_ros,
     "recorder": check_recorder,
+    "shipping": check_shipping,
     "topics": check_topics,
 }
 _OF_SETTINGS: Final = {"server": check_server}

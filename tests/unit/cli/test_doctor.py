@@ -5,6 +5,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -14,8 +15,9 @@ import pytest
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.cli import doctor
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.mcap_surgery import raw_mcap
@@ -303,6 +305,25 @@ def test_what_this_user_may_not_read_is_not_advised_to_be_copied_and_ends_no_rep
     found = examined(2)
     assert found["disk"][-1]["seen"] == "leaving.json: Permission denied"
     assert "bags" in found
+
+
+def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_newest_receipt(
+    robot: Path, examined: Examined
+) -> None:
+    old = time.time_ns() - 2 * 3600 * NS_PER_S
+    path = write_mcap(robot / "old" / "old_0.mcap", [odom(old, 0.0, 0.0)])
+    assert "shipping" not in examined(0)
+    required = "retention.require_shipped=true"
+    [finding] = examined(1, required)["shipping"]
+    assert "2 of 2 closed bags not shipped" in finding["seen"]
+    assert "no receipt" in finding["seen"]
+    other = Receipt("old/old_1.mcap", "id", 1, "00", "lake", old)
+    append_receipts(robot, [other])
+    seen = examined(1, required)["shipping"][0]["seen"]
+    assert seen == f"2 of 2 closed bags not shipped; the newest receipt is from {iso_local(old)}"
+    append_receipts(robot, [replace(other, bag="old/old_0.mcap", size=path.stat().st_size)])
+    # The other one has just been closed.
+    assert examined(0, required) == {}
 
 
 def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
