@@ -41,6 +41,7 @@ from ros2_memory.history.view import View, clamped, open_view
 from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.recap import events_by_topic
 from ros2_memory.insights.silences import silences_in
+from ros2_memory.places.placed_standstills import placed_standstills, stood_at
 from ros2_memory.places.pose_frames import (
     MapPlacement,
     changing_origin,
@@ -49,14 +50,12 @@ from ros2_memory.places.pose_frames import (
     known_track,
     places_in,
 )
-from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import (
     ComparedMover,
     ComparedThing,
     ComparedThings,
     Comparison,
-    FarFromOther,
     Pair,
     StandstillPlace,
     ThingStay,
@@ -85,7 +84,6 @@ _Kind: TypeAlias = Literal[
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}
-_LEAST_APART_M: Final = 0.5
 _LEAST_MINUTES: Final = 0.2
 _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
@@ -106,8 +104,8 @@ def compare(
 ) -> Comparison:
     """Returns what differs in a window (Unix seconds, inclusive) from another one.
 
-    `where` selects the things that are in a region in either window, and the time, the standstills
-    and the points of the way in that region.
+    `where` selects the things that are in a region in either window, and the time and the
+    standstills in that region.
 
     Raises:
         InvalidArgumentsError: the bounds make no window, or `where` is no region.
@@ -126,7 +124,7 @@ def compare(
     this, that = sides = _side_of(views[0], windows[0]), _side_of(views[1], windows[1])
     frame, things = _compare_things(sides, region)
     minutes = _minutes_in_places(sides, region)
-    paths = _compare_paths(sides, region)
+    way_frame, stood = _compare_standstills(sides, region)
     note_unread(this.view, this.window, of="from start to end: ", gaps=False)
     note_unread(that.view, that.window, of="from with_start to with_end: ", gaps=False)
     notes = this.view.notes
@@ -148,9 +146,8 @@ def compare(
         places=_differing(*minutes, least=_LEAST_MINUTES),
         errors=_differing(this.errors, that.errors, least=_LEAST_COUNT, unlisted=unlisted),
         silences=_differing(this.silences, that.silences, least=_LEAST_SILENT_S, unlisted=unlisted),
-        way_frame_id=paths.frame_id,
-        stood=paths.stood,
-        farthest=paths.farthest,
+        way_frame_id=way_frame,
+        stood=stood,
         notes=tuple(dict.fromkeys([*notes.sentences(), *that.view.notes.sentences()])),
     )
 
@@ -476,55 +473,38 @@ def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, flo
     }
 
 
-class _PathDifferences(NamedTuple):
-    """Where the robot stood or drove in one window and not in the other.
+def _compare_standstills(
+    sides: tuple[_Side, _Side], where: Where | None
+) -> tuple[str, tuple[StandstillPlace, ...]]:
+    """Returns where the robot stood longer in one window, the largest difference first.
 
-    Attributes:
-        frame_id: the frame of the places; empty if paths cannot be compared.
-        stood: where it stood longer in one window, the largest difference first.
-        farthest: for each window the point that is farthest from the other window's path.
+    The frame of the places comes before them; it is empty if they cannot be compared.
     """
-
-    frame_id: str = ""
-    stood: tuple[StandstillPlace, ...] = ()
-    farthest: tuple[FarFromOther | None, FarFromOther | None] = None, None
-
-
-def _compare_paths(sides: tuple[_Side, _Side], where: Where | None) -> _PathDifferences:
-    """Returns where the robot stood, and where it drove, in one window and not in the other."""
     view = sides[0].view
     placement, *others = {side.placement for side in sides}
     if placement is None or others or any(side.drive.path is None for side in sides):
-        return _PathDifferences()
+        return "", ()
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
-        return _PathDifferences()
+        return "", ()
     if not placement.is_map and not _are_of_one_run(sides):
         view.notes.add(
-            f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
-            "lead to a map"
+            f"standstills are not compared: {changing_origin(frame)}, and no transforms lead to a "
+            "map"
         )
-        return _PathDifferences()
+        return "", ()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    stands, tracks = [], []
+    stands = []
     for side in sides:
         track = known_track(side.view, frame, side.window).track
         spans = (stop.span for stop in side.drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
-        tracks.append((track, side.window))
-    stood = [
+    stood = (
         at._replace(inside=places_at(places, frame, *at.place))
         for at in _standstill_differences(stood_at(*stands))
-    ]
-    farthest: list[FarFromOther | None] = []
-    for point in farthest_apart(tracks[0], tracks[1], region):
-        if point is None or point.away_m < _LEAST_APART_M:
-            farthest.append(None)
-        else:
-            farthest.append(point._replace(inside=places_at(places, frame, *point.place)))
-    this, other = farthest
-    return _PathDifferences(frame, tuple(stood), (this, other))
+    )
+    return frame, tuple(stood)
 
 
 def _standstill_differences(places: Iterable[StandstillPlace]) -> list[StandstillPlace]:

@@ -44,7 +44,6 @@ from ros2_memory.results.things import (
     ComparedThing,
     ComparedThings,
     Comparison,
-    FarFromOther,
     Pair,
     StandstillPlace,
     StillThere,

@@ -408,15 +408,6 @@ class StandstillPlace(NamedTuple):
     since: tuple[Ns | None, Ns | None]
 
 
-class FarFromOther(NamedTuple):
-    """A point of a path: x, y (m), its distance from the other path, when it was first there."""
-
-    place: tuple[float, float]
-    inside: tuple[str, ...]
-    away_m: float
-    time: Ns
-
-
 _STANDSTILLS: Final = objects(
     keys(
         _XY.spread("place"),
@@ -425,15 +416,6 @@ _STANDSTILLS: Final = objects(
         TIME("this_since", lambda stood: stood.since[0]).if_known,
         TIME("with_since", lambda stood: stood.since[1]).if_known,
         LOCAL_OF_DAYS("local", lambda stood: next(filter(None, stood.since), None)),
-    )
-)
-_FAR: Final = an_object(
-    keys(
-        _XY.spread("place"),
-        INSIDE("inside"),
-        digits(1)("away_m"),
-        TIME("t", "time"),
-        LOCAL_OF_DAYS("local", "time"),
     )
 )
 
@@ -451,7 +433,6 @@ def compared(most: int) -> Keys:
         PLAIN("things_unchanged", "things.same").in_short,
         _named_pairs(2)("way").if_any.in_short,
         _STANDSTILLS("stood_at", "stood").first(most, "total").if_any,
-        by_name(_FAR)("farthest_apart").if_any,
         _named_pairs(2)("minutes", "places").first(most, "total").if_any,
         _named_pairs(0)("errors").first(most, "total").if_any.in_short,
         _named_pairs(0)("silent_s", "silences").first(most, "total").if_any,
@@ -474,10 +455,8 @@ class Comparison(AnswerWithNotes):
         places: minutes in each named place.
         errors: how often each error was reported.
         silences: for how many seconds each topic was silent.
-        way_frame_id: of the path, and of the places where the robot stood.
+        way_frame_id: of the places where the robot stood.
         stood: where it stood in one window longer than in the other.
-        farthest: the point of each path that is farthest from the other path; None if the paths are
-            the same.
     """
 
     oldest: Ns
@@ -492,21 +471,14 @@ class Comparison(AnswerWithNotes):
     silences: tuple[tuple[str, Pair], ...]
     way_frame_id: str = ""
     stood: tuple[StandstillPlace, ...] = ()
-    farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
-
-    @property
-    def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
-        """The farthest points with the names of their windows."""
-        points = zip(("this", "with"), self.farthest, strict=True)
-        return [(name, point) for name, point in points if point is not None]
 
     @property
     def frames(self) -> JsonObject:
-        """The frames of the places that are shown: of things, and of the path if it is another."""
+        """The frames of the places shown: of things, and of standstills if it is another."""
         frames: list[str | None] = []
         if self.things.is_any:
             frames.append(self.frame_id or None)
-        if (self.stood or self.farthest_apart) and self.way_frame_id not in frames:
+        if self.stood and self.way_frame_id not in frames:
             frames.append(self.way_frame_id)
         names = [frame and named(frame) for frame in frames]
         return dict(zip(("frame_id", "way_frame_id"), names, strict=False))

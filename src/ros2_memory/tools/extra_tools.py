@@ -89,7 +89,7 @@ _COMPARE = ToolDeclaration(
     "to the later. Within a tenth is equal. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
     "more_or_fewer, movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
-    "farthest_apart, minutes, errors, silent_s}}.",
+    "minutes, errors, silent_s}}.",
     CompareArguments,
     compare,
     blocking=True,

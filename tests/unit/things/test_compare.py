@@ -63,7 +63,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     write_splits(tmp_path / "two", stood, name="first")
     write_splits(tmp_path / "two", later, name="second")
     reply = ask_compare(tmp_path / "two", **EARLIER, **LATER)
-    assert not reply.keys() & {"stood_at", "farthest_apart"}
+    assert "stood_at" not in reply
     assert any("changes with every start" in note for note in reply["notes"])
     assert any("from one run of odometry to another" in note for note in reply["notes"])
     # It was seen in both windows, so that one was not "not looked at".

@@ -1,0 +1,114 @@
+"""Where the robot stood still, and the places where it stood in two windows.
+
+Both tracks must be in one frame. That frame should be the map, unless odometry went on between the
+two windows: after a restart the same coordinates are another place.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.core.arrays import Flags, Ints, bounds_of
+from ros2_memory.core.timebase import Ns, Span, unix_from_ns
+from ros2_memory.results import Pair, StandstillPlace
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.regions import Region
+
+SAME_STAND_M: Final = 0.5
+"""Standstills so near to each other are at one place."""
+
+_SAMPLES_OF_STAND: Final = 9
+"""The place of a standstill is the median of so many samples."""
+
+
+class PlacedStandstill(NamedTuple):
+    """A standstill and its place (m); `start` is a log time, `duration` in ns."""
+
+    x: float
+    y: float
+    start: Ns
+    duration: Ns
+
+
+def placed_standstills(
+    track: RobotTrack, spans: Iterable[Span], region: Region | None = None
+) -> Iterator[PlacedStandstill]:
+    """Yields standstills with their places on the track; only those in a region, if it is given.
+
+    Standstills outside of the track's pieces are left out.
+    """
+    ends = bounds_of(spans).T
+    if not len(track.times) or not len(ends):
+        return
+    times = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
+    is_known = _is_known(track, times)
+    has_known = is_known.any(axis=1)
+    ends, times, is_known = ends[has_known], times[has_known], is_known[has_known]
+    x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(times)[:2])
+    rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
+    for stand_x, stand_y, start, stop in rows:
+        if region is None or region.contains(stand_x, stand_y):
+            yield PlacedStandstill(stand_x, stand_y, start, stop - start)
+
+
+def _is_known(track: RobotTrack, times: Ints) -> Flags:
+    """Returns which log times lie in a piece of the track, or within `SILENCE_NS` of one."""
+    starts, stops = track.pieces
+    piece = np.searchsorted(starts - SILENCE_NS, times, side="right") - 1
+    return (piece >= 0) & (times <= stops[piece] + SILENCE_NS)
+
+
+class _PlaceStands(NamedTuple):
+    """A place (m), and the standstills there in each of two windows."""
+
+    x: float
+    y: float
+    this: list[PlacedStandstill]
+    other: list[PlacedStandstill]
+
+
+def stood_at(
+    this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
+) -> list[StandstillPlace]:
+    """Returns the places where the robot stood in two windows, and how long in each.
+
+    A place is where the robot stood longest, and gathers standstills within `SAME_STAND_M`. The
+    names of places are left empty.
+    """
+    stands = [*((stand, False) for stand in this), *((stand, True) for stand in other)]
+    stands.sort(key=lambda marked: (-marked[0].duration, marked[0]))
+    middles = np.empty((len(stands), 2))
+    places: list[_PlaceStands] = []
+    for stand, is_other in stands:
+        squared = ((middles[: len(places)] - (stand.x, stand.y)) ** 2).sum(axis=1)
+        if (squared <= SAME_STAND_M**2).any():
+            place = places[int(squared.argmin())]
+        else:
+            middles[len(places)] = stand.x, stand.y
+            place = _PlaceStands(stand.x, stand.y, [], [])
+            places.append(place)
+        (place.other if is_other else place.this).append(stand)
+    return [
+        StandstillPlace(
+            (place.x, place.y),
+            (),
+            Pair(_total_s(place.this), _total_s(place.other)),
+            (_first_start(place.this), _first_start(place.other)),
+        )
+        for place in places
+    ]
+
+
+def _total_s(stands: Iterable[PlacedStandstill]) -> float:
+    return unix_from_ns(sum(stand.duration for stand in stands))
+
+
+def _first_start(stands: Iterable[PlacedStandstill]) -> Ns | None:
+    return min((stand.start for stand in stands), default=None)
