@@ -253,7 +253,7 @@ def test_what_is_drawn_is_the_reply_itself(robot: Robot, host: ChatHost, chromiu
     path = robot.ask(host, "trajectory_summary", CALLS["trajectory_summary"])
     drawn(chromium)
     corners = [[point["timestamp"], point["x"], point["y"]] for point in path["waypoints"]]
-    shown = "return map.paths[0].t.map((t, n) => [t, map.paths[0].x[n], map.paths[0].y[n]])"
+    shown = "return map.path.t.map((t, n) => [t, map.path.x[n], map.path.y[n]])"
     assert chromium.run(shown) == corners
     found = robot.ask(host, "find_things", {})
     drawn(chromium)
@@ -278,13 +278,13 @@ def test_the_height_follows_the_content_and_a_click_asks_further_through_the_hos
     chromium.leave_frames()
     chromium.awaits("return proxy.clientHeight === arguments[0]", high)
     host.enter()
-    assert chromium.run("return map.paths[0].t.length") == 0
+    assert chromium.run("return map.path.t.length") == 0
     chromium.run("document.querySelectorAll('#more button')[1].click()")
     asked = host.await_heard("tools/call")
     span = {"start": SPAN["start"], "end": SPAN["end"], "frame_id": "map", "max_waypoints": 200}
     assert asked["params"] == {"name": "trajectory_summary", "arguments": span}
     host.answer(asked, result=robot.call("trajectory_summary", span))
-    chromium.awaits("return map.paths[0].t.length > 5")
+    chromium.awaits("return map.path.t.length > 5")
     assert "Path" in chromium.text("#further-title")
     # The stops of the recap stay on the map, and one of them is asked about.
     assert chromium.run("return map.stops.length") > 0

@@ -128,7 +128,7 @@ def test_a_first_look_is_four_requests_and_shows_the_memory_at_a_glance(page: Br
     assert state.startswith("! Damaged bags")
     assert page.run("return document.querySelectorAll('#state .good').length") == 0
     # Nobody knows how it came over the gap.
-    assert page.run("return [...map.paths[0].starts].length") == 2
+    assert page.run("return [...map.path.starts].length") == 2
     assert "stood at x 15.00, y 0.00" in events
     assert "Robot\nx\u00a030.00, y\u00a00.00\u00a0m" in page.text("#moment")
     assert painted(page, "#map") > 1000
@@ -303,7 +303,7 @@ def test_where_no_pose_topic_is_clear_it_is_chosen_and_the_address_keeps_it(
         for topic, end in (("/wheels", (9.9, 0)), ("/lidar", (0, 19.8)), ("/fix", (0, 11.01))):
             select(chromium, "poses", topic)
             chromium.awaits("return state.view.poses === arguments[0] && state.view.isWhole", topic)
-            x, y = chromium.run("return [map.paths[0].x.at(-1), map.paths[0].y.at(-1)]")
+            x, y = chromium.run("return [map.path.x.at(-1), map.path.y.at(-1)]")
             assert (x, y) == pytest.approx(end, abs=0.02)
         assert "east and north of 48.123457, 11.765432" in chromium.text("#map-key")
         show(chromium, server, chromium.run("return location.hash"))
@@ -716,8 +716,8 @@ def test_new_data_is_shown_by_the_next_poll_without_a_reload(
         assert path["x"][-1] == 30
         assert path["begins"] == [0]
         # The path through every pose goes on, too, without a gap.
-        chromium.awaits("return (map.exactly(map.paths[0]) || { x: [0] }).x.at(-1) === 30")
-        assert chromium.run("return map.exactly(map.paths[0]).begins") == [0]
+        chromium.awaits("return (map.exactly() || { x: [0] }).x.at(-1) === 30")
+        assert chromium.run("return map.exactly().begins") == [0]
         # Totals follow, as often as a hundredth of the time allows.
         label = "return document.getElementById('map').getAttribute('aria-label')"
         chromium.awaits(f"{label}.includes('30.0 m driven')")
@@ -736,12 +736,7 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
     drive(bag_dir, "wren", T0 + 5 * NS_PER_S, 20, x=100.0)
     with replaying(chromium, bag_dir) as server:
         assert "Robots are mixed: robin, wren overlap" in chromium.text("#mixed")
-        # Each has a path of its own, and the robots are where they were at one time.
-        drawn = "return map.paths.map((each) => [each.name, each.x[0], each.x.at(-1)])"
-        assert chromium.run(drawn) == [["robin", 0, 20], ["wren", 100, 120]]
-        assert "robin\nwren" in chromium.text("#map-key")
-        chromium.run("map.place(arguments[0])", T0_S + 8)
-        assert chromium.run("return map.moments.map((each) => Math.round(each.x))") == [8, 103]
+        assert "The map joins their paths" in chromium.text("#mixed")
         offered = chromium.run("return [...document.getElementById('recording').options]")
         assert len(offered) == 3
         select(chromium, "recording", "wren")
@@ -758,7 +753,6 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
         assert "x\u00a02.00" not in chromium.text("#moment")
         show(chromium, server, "#last=all&recording=robin")
         assert chromium.run("return Math.max(...state.view.path.x)") == 20
-        assert chromium.run("return map.paths.length") == 1
         choose(chromium, "data_time_range")
         chromium.press("#send")
         chromium.awaits(ANSWERED)
@@ -776,7 +770,7 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
 
 OFF_PATH = """
   const [poses] = arguments;
-  const shape = map.exactly(map.paths[0]);
+  const shape = map.exactly();
   const inside = poses.map(([x, y]) => [map.px(x), map.py(y)]).filter(([x, y]) =>
     x > 0 && y > 0 && x < map.canvas.clientWidth && y < map.canvas.clientHeight);
   const away = ([x, y]) => Math.min(...shape.t.slice(1).map((_, n) => {
@@ -807,7 +801,7 @@ def test_at_every_zoom_the_path_and_the_arrow_on_it_are_as_driven_and_headings_o
         for factor in (1, 6, 6, 3):
             chromium.run("map.zoom(arguments[0], map.px(1), map.py(1))", factor)
             chromium.run("map.pan(map.canvas.clientWidth / 2 - map.px(1), 0)")
-            chromium.awaits("return map.exactly(map.paths[0]) !== null")
+            chromium.awaits("return map.exactly() !== null")
             at_s = T0_S + math.pi / 2 / 0.4 + 0.02  # it passes x 1, y 1
             inside, off_px, arrow_px = chromium.run(OFF_PATH, poses, at_s)
             assert inside >= 5

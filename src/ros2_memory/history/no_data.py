@@ -6,10 +6,9 @@ import math
 import re
 from contextlib import suppress
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.silences import LONGEST_OFF_NS
-from ros2_memory.bag_dir.layout import is_derived, is_thinned
+from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -22,7 +21,6 @@ from ros2_memory.core.timebase import (
     Ns,
     unix_from_ns,
 )
-from ros2_memory.history.context import short_name
 from ros2_memory.history.coverage import (
     being_written,
     cut_spans,
@@ -35,7 +33,6 @@ from ros2_memory.history.coverage import (
     why_nothing,
 )
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -328,8 +325,7 @@ def no_data_at(
         deleted: whether a message that would have counted may have been deleted.
     """
     this_moment = TimeWindow(at, at + 1)
-    nearest = _nearest(view, topics, this_moment, (at, at + 1))
-    older, newer = nearest.older, nearest.newer
+    older, newer = _nearest(view, topics, at, at + 1)
     if around is not None:
         when, start, stop = f"within {seconds(around)} of", at - around, at + around + 1
     elif tolerance is not None:
@@ -338,11 +334,11 @@ def no_data_at(
         when, start, stop = "at or before", MIN_NS, at + 1
     window = TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
     why: list[str] = []
-    if not nearest.on_both_sides:
+    if older is None or newer is None:
         reason = reason_beyond(view, at)
     else:
         reason = reason_between(view, window)
-        if older and newer and around is None and reason is NoDataReason.GAP:
+        if around is None and reason is NoDataReason.GAP:
             reason, why = _reason_within_recording(view, older, newer)
     if (
         deleted
@@ -353,7 +349,6 @@ def no_data_at(
         reason = NoDataReason.DELETED
     detail = [
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
-        *nearest.only_elsewhere,
         *_distances(at, older, newer, tolerance),
         *why,
         *_advice(view, reason, at),
@@ -408,17 +403,16 @@ def _reason_within_recording(
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """Returns the error for no message of these topics in a window."""
-    nearest = _nearest(view, topics, window, (window.start - 1, window.stop))
+    older, newer = _nearest(view, topics, window.start - 1, window.stop)
     start, end = window.asked()
     detail = [
-        f"no message of {' or '.join(topics)} between {unix_text(start)} and {unix_text(end)}",
-        *nearest.only_elsewhere,
+        f"no message of {' or '.join(topics)} between {unix_text(start)} and {unix_text(end)}"
     ]
-    if nearest.older:
-        detail.append(f"the last one before is at {unix_text(nearest.older.time)}")
-    if nearest.newer:
-        detail.append(f"the first one after is at {unix_text(nearest.newer.time)}")
-    if nearest.on_both_sides:
+    if older:
+        detail.append(f"the last one before is at {unix_text(older.time)}")
+    if newer:
+        detail.append(f"the first one after is at {unix_text(newer.time)}")
+    if older and newer:
         reason = reason_between(view, window)
     else:
         reason = reason_beyond(view, min(end, max(start, view.memory.clock.now())))
@@ -478,86 +472,12 @@ def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataErro
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 
 
-class _Nearest(NamedTuple):
-    """The messages around a window without a message.
-
-    Attributes:
-        older: the last message before it, unless it is too old to say anything.
-        newer: the first message after it.
-        only_elsewhere: a sentence if the recordings of the window have none of the topics.
-        on_both_sides: whether there are messages before and after it, of whatever time.
-    """
-
-    older: StoredMessage | None
-    newer: StoredMessage | None
-    only_elsewhere: list[str]
-    on_both_sides: bool
-
-
 def _nearest(
-    view: View, topics: tuple[str, ...], window: TimeWindow, ends: tuple[Ns, Ns]
-) -> _Nearest:
-    """Returns the last message up to the first end (log time), and the first from the second on.
-
-    If the recordings of the window have none of the topics, messages of another time are left out:
-    they may be of another robot.
-    """
-    until, since = ends
+    view: View, topics: tuple[str, ...], until: Ns, since: Ns
+) -> tuple[StoredMessage | None, StoredMessage | None]:
+    """Returns the last message up to a log time, and the first from another one on."""
     older = view.stream.first(topics, TimeWindow.until(until), newest_first=True)
-    newer = view.stream.first(topics, TimeWindow(since, MAX_NS))
-    on_both_sides = older is not None and newer is not None
-    only_elsewhere = _only_elsewhere(view, topics, window)
-    if only_elsewhere:
-        if older is not None and window.start - older.time > LONGEST_OFF_NS:
-            older = None
-        if newer is not None and newer.time - window.stop > LONGEST_OFF_NS:
-            newer = None
-    return _Nearest(older, newer, only_elsewhere, on_both_sides)
-
-
-def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:
-    """Returns a sentence if the recordings of a window have none of these topics at all.
-
-    It names topics there that carry the same (poses, velocities). Where a folder has bags of
-    several robots, the nearest message of a topic may be another robot's.
-    """
-    if _are_cut(view, topics, window):
-        return []
-    timeline, whole = view.timeline, view.snapshot.metadata_folders
-    names: dict[str, None] = {}
-    recorded: set[str] = set()
-    for bag in timeline.overlapping(window):
-        if is_derived(bag.file):
-            continue
-        recorded.update(bag.summary.schema.positions)
-        if is_named_after_folder(bag.file) or str(bag.recording) in whole:
-            if any(bag.recording in timeline.recordings(topic) for topic in topics):
-                return []
-            names[bag.recording.name] = None
-        else:
-            names[short_name(bag.path)] = None
-    if not names or not recorded.isdisjoint(topics):
-        return []
-    recordings, verb = "recording", "has"
-    if len(names) > 1:
-        recordings, verb = counted(len(names), "recording"), "have"
-    sentence = f"the {recordings} of that time, {listed(sorted(names))}, {verb} no such topic"
-    alike = _topics_alike(view, topics, recorded)
-    if alike:
-        sentence += f"; similar there: {listed(alike)}; give topic"
-    return [sentence]
-
-
-def _topics_alike(view: View, topics: tuple[str, ...], recorded: set[str]) -> list[str]:
-    """Returns recorded topics that carry all that `topics` carry, or else some of it."""
-
-    def kinds_of(*topics: str) -> set[str]:
-        types = chain.from_iterable(map(view.timeline.types_of, topics))
-        return set(chain.from_iterable(map(view.extractor.kinds_of, types)))
-
-    wanted = kinds_of(*topics)
-    with_some = [topic for topic in sorted(recorded) if kinds_of(topic) & wanted]
-    return [topic for topic in with_some if kinds_of(topic) >= wanted] or with_some
+    return older, view.stream.first(topics, TimeWindow(since, MAX_NS))
 
 
 def reason_between(view: View, window: TimeWindow) -> NoDataReason:

@@ -190,8 +190,7 @@ def placed_waypoints(
     """Returns waypoints of a topic's poses in another frame, each by the transforms of its time.
 
     At both ends of a recording its first and last transforms hold for 2 s more, as for tracks.
-    Waypoints that no transform places are left out, with a note. Waypoints behind a jump of the
-    frame are marked.
+    Waypoints that no transform places are left out, with a note.
 
     Raises:
         InvalidArgumentsError: no transform leads to `frame_id` at any time.
@@ -212,9 +211,7 @@ def placed_waypoints(
     if len(placed_ones) < len(waypoints):
         left_out = counted(len(waypoints) - len(placed_ones), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
-    if not placed_ones or own_frame == frame_id or topic != resolve_path_topic(view):
-        return tuple(placed_ones)
-    return _with_jumps(view, placed_ones, frame_id)
+    return tuple(placed_ones)
 
 
 def _placed_waypoint(
@@ -236,32 +233,6 @@ def _placed_waypoint(
             turn = None if waypoint.yaw_rad is None else yaw(in_frame.orientation)
             return replace(waypoint, position=in_frame.position, yaw_rad=turn)
     return None
-
-
-def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tuple[Waypoint, ...]:
-    """Returns waypoints of the robot's path, with `jump` set behind each jump of the frame."""
-    window = TimeWindow(waypoints[0].time, waypoints[-1].time + 1)
-    try:
-        known = TrackReader(view, frame_id).track_in(window)
-    except QueryTimeoutError:
-        view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
-        return tuple(waypoints)
-    if known.since is not None:
-        view.notes.add_lack(
-            f"where {frame_id} jumped is known back to {unix_text(known.since)}: out of time "
-            "before older poses were placed"
-        )
-    track = known.track
-    jumped = track.times[1:][jumps(track)[:-1]]
-    reached = np.searchsorted(jumped, [waypoint.time for waypoint in waypoints], side="right")
-    is_after = np.diff(reached, prepend=reached[0]) > 0
-    if is_after.any():
-        across = counted(int(is_after.sum()), "waypoint")
-        view.notes.add(f"{frame_id} jumped before {across}: the line to there was not driven")
-    return tuple(
-        replace(waypoint, jump=waypoint.jump or after)
-        for waypoint, after in zip(waypoints, is_after.tolist(), strict=True)
-    )
 
 
 def _require_transform(

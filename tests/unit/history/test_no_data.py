@@ -83,28 +83,6 @@ def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s
     assert ask(timestamp=T0_S + older_s, tolerance_s=float(advised[1]))["timestamp"] == T0_S
 
 
-@pytest.mark.parametrize("loose", [False, True])
-def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robots(
-    tmp_path: Path, loose: bool
-) -> None:
-    """Years apart: what the recording of that time has is named, and where to look in it."""
-    names = ("robin", "wren") if loose else ("robin/robin_0", "wren/wren_0")
-    year = 365 * 86_400
-    own = [odom(T0 + n * S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
-    write_mcap(tmp_path / f"{names[0]}.mcap", [*own, text(T0, "one")])
-    write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * S, 0.0, 0.0)])
-    ask = partial(asked, memory_of(tmp_path))
-    detail = ask("get_position_at", timestamp=T0_S + 5)["detail"]
-    assert "robin" in detail
-    assert "has no such topic; similar there: /base/odometry; give topic" in detail
-    assert "nearest" not in detail
-    ranged = ask("get_topic_in_range", topic="/odom", start=T0_S + 1, end=T0_S + 3)
-    assert "similar there: /base/odometry" in ranged["detail"]
-    # Between the two there is nothing to tell them apart by.
-    between = ask("get_position_at", timestamp=T0_S + 86_400)
-    assert "nearest newer one is 364 days after" in between["detail"]
-
-
 TRUE = {"topic": "/bumper", "condition_type": "equals", "value": True}
 
 WINDOWED: dict[str, dict[str, Any]] = {

@@ -15,7 +15,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import odom, tf, transform, write_mcap, write_splits
+from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN, S
@@ -29,48 +29,6 @@ def in_both_frames(memory: Memory, span: dict[str, float]) -> tuple[Any, Any]:
     """What was driven, with waypoints in the frame of the poses, and in the map."""
     own = asked(memory, "trajectory_summary", **span)
     return own, asked(memory, "trajectory_summary", frame_id="map", **span)
-
-
-@each_way
-def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bool) -> None:
-    """Drives straight on in odometry, while the map is corrected by 10 m to the side, once."""
-    messages = []
-    for step in range(600):
-        at, off_m = BEGIN + step * S // 10, 0.0 if step < 300 else 10.0
-        pose = transform(at, "odom", "base_link", (step * 0.03, 0.0, 0.0))
-        messages += [
-            odom(at, step * 0.03, 0.0, vx=0.3),
-            tf(at, transform(at, "map", "odom", (0.0, off_m, 0.0)), pose),
-        ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
-    span = {"start": BEGIN / S, "end": BEGIN / S + 100}
-    own, moved = in_both_frames(memory, span)
-    assert [each.get("jump", False) for each in own["waypoints"]] == [False, False]
-    assert [(each["y"], each.get("jump", False)) for each in moved["waypoints"]] == [
-        (0.0, False),
-        (10.0, True),
-    ]
-    note = "map jumped before 1 waypoint: the line to there was not driven"
-    assert note in moved["notes"]
-    assert note not in own["notes"]
-
-
-def test_where_the_map_jumped_before_its_time_was_over_is_not_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    messages = []
-    for step in range(60):
-        at, off_m = BEGIN + step * S, 0.0 if step < 15 else 10.0
-        pose = transform(at, "odom", "base_link", (step * 0.3, 0.0, 0.0))
-        there = transform(at, "map", "odom", (0.0, off_m, 0.0))
-        messages += [odom(at, step * 0.3, 0.0, vx=0.3), tf(at, there, pose)]
-    write_splits(tmp_path, messages)
-    monkeypatch.setattr("ros2_memory.places.robot_tracks._READING_S", 0.0)
-    call = Call(deadline=Deadline.after(100))
-    found = trajectory_summary(memory_of(tmp_path), call, ALL, frame_id="map")
-    assert not any(each.jump for each in found.trajectory.waypoints)
-    assert any(note.startswith("where map jumped is known back to") for note in found.notes)
 
 
 @each_way

@@ -39,7 +39,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, tf, transform, write_mcap, write_splits
+from tests.support.bags import detections, odom, write_mcap, write_splits
 from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
@@ -228,61 +228,6 @@ def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
     assert names == ["moments/y/e", "moments/x/d", "wren/c", "robin", "robin/b", "robin/a"]
     assert rows[3] == {"name": "robin", "start": BEGIN_S, "end": BEGIN_S + 1, "holds": 2}
     assert len(recordings.alone("robin").index.snapshot().bags) == 2
-
-
-def paths_in(memory: Memory, start_s: int, stop_s: int) -> Any:
-    window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
-    return Recordings(memory).paths(memory, Call(), window)["paths"]
-
-
-@pytest.mark.parametrize(
-    ("driven", "expected"),
-    [
-        # Wren's two recordings follow each other, robin drives beside them, and jay long before.
-        (
-            {"jay": (-900, 0), "robin": (0, 10), "wren/a": (0, 20), "wren/b": (11, 30)},
-            {
-                (0, 30): {"robin": (10, 20), "wren": (20, 40)},
-                (-1000, 30): {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)},
-                (-1000, -800): {},
-            },
-        ),
-        (
-            {"hall/robin": (0, 0), "hall/wren": (0, 100), "yard/jay": (0, 200)},
-            {(0, 30): {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}},
-        ),
-    ],
-    ids=["a folder of recordings", "a folder of robots"],
-)
-def test_robots_that_overlap_have_a_path_each(
-    tmp_path: Path, driven: dict[str, tuple[int, int]], expected: dict[tuple[int, int], object]
-) -> None:
-    for name, (begins, x) in driven.items():
-        poses = [odom(BEGIN + begins * S + n * S // 10, x + n / 10, 0.0) for n in range(101)]
-        write_mcap(tmp_path / name / "0.mcap", poses)
-    memory = memory_of(tmp_path)
-    for span_s, ends in expected.items():
-        found = paths_in(memory, *span_s)
-        assert {each["name"]: (each["x"][0], each["x"][-1]) for each in found} == ends
-
-
-def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
-    tmp_path: Path,
-) -> None:
-    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
-        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
-        at = poses[0].log_time
-        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
-        mounted = tf(at, mount, topic="/tf_static")
-        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
-    memory = memory_of(tmp_path)
-
-    def robots(start_s: int, stop_s: int) -> list[str]:
-        return [each["name"] for each in paths_in(memory, start_s, stop_s)]
-
-    assert robots(0, 600) == ["robin", "wren"]
-    assert robots(0, 1000) == ["jay", "robin", "wren"]
-    assert robots(0, 400) == []
 
 
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ let statusAt = 0;
 let pause = FILLING_MS;
 let lookedAt = 0;
 const running = new Map();  // by kind: cancels what is asked besides a look
-const closest = new Map();  // by path: what was asked of it last
+let closest = {};  // what was asked last of the path
 let lookLater = 0;
 let restLater = 0;
 let turn = 0;  // of questions about a moment
@@ -122,7 +122,6 @@ async function look(isMore = false, isPatient = false) {
     isWholeOwed = reply.whole_ms === undefined;
     if (!isWholeOwed) wholeAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
-    if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) {
       reply.events.forEach((each) => uncut(each, reply.range || view.range));
       reply.events.push(...always(reply, reply.range || view.range));
@@ -197,21 +196,21 @@ async function lookAtLabels() {
   }
 }
 /* The path as it was driven where the map shows it, once the map rests. */
-function closer(path, box, since) {
+function closer(box, since) {
   const { span, view } = state;
-  const given = { ...chosenPart(), ...(path.name ? { recording: path.name } : {}), ...box,
-    start: (since ?? span.start).toFixed(3), end: Math.max(span.end, view.end).toFixed(3) };
-  const asking = `${new URLSearchParams(given)} ${view.of}`;
-  const before = closest.get(path.name) || {};
-  if (before.asking === asking) return;
-  clearTimeout(before.timer);
+  const { of } = view;
+  const given = { ...chosenPart(), ...box, start: (since ?? span.start).toFixed(3),
+    end: Math.max(span.end, view.end).toFixed(3) };
+  const asking = `${new URLSearchParams(given)} ${of}`;
+  if (closest.asking === asking) return;
+  clearTimeout(closest.timer);
   const mine = { asking };
-  closest.set(path.name, mine);
+  closest = mine;
   mine.timer = setTimeout(async () => {
     try {
       const reply = await asked("/page/path", given);
-      if (closest.get(path.name) !== mine) return;
-      map.enlarge(path, box, reply, since);
+      if (closest !== mine) return;
+      map.enlarge(box, reply, since, of);
       showKey();
     } catch (error) {
       if (error instanceof Locked) lock(error);  // else the path stays as the first look has it
@@ -254,12 +253,11 @@ function always(reply, range) {
 }
 /* Whether an answer has all that was asked for, and that takes long. */
 function isWhole(reply, given) {
-  return Boolean(reply.events && reply.path !== undefined && (reply.things || given.get("things") === "0"))
-    && !(reply.paths || []).some((each) => each.late);
+  return Boolean(reply.events && reply.path !== undefined && (reply.things || given.get("things") === "0"));
 }
 function whole(reply, before) {
-  const { path = null, paths = [], seen = null, robot = null, places = [], things = [], events = [] } = before || {};
-  return { path, paths, seen, robot, places, things, events, moments: [], owed: null, ...reply,
+  const { path = null, seen = null, robot = null, places = [], things = [], events = [] } = before || {};
+  return { path, seen, robot, places, things, events, moments: [], owed: null, ...reply,
     isWhole: isWhole(reply, new URLSearchParams()) };
 }
 /* What is shown, with an answer about what came since. */
@@ -414,10 +412,7 @@ function showRecordings(view) {
   at("ask-one").replaceChildren("Answers are from the recording ", bdi(state.recording), " alone.");
   at("mixed").hidden = !mixed.length;
   at("mixed").replaceChildren(...mixed.map((each) => el("p", {}, `! ${each[0].toUpperCase()}${each.slice(1)}.`)),
-    ...(mixed.length ? [el("p", {}, apart(view)
-      ? "The map has a path for each recording. All else on this page is of all of them together: "
-        + "choose one recording above to see it alone."
-      : "The map joins their paths. Choose one recording above.")] : []));
+    ...(mixed.length ? [el("p", {}, "The map joins their paths. Choose one recording above.")] : []));
 }
 function showFilling(filling) {
   at("filling").hidden = !filling;
@@ -432,7 +427,6 @@ function showKey() {
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
   const { stops } = view.counts || {};  // the longest are among the events
-  const left = view.paths_left_out;
   // Without poses there is no map: the reason is shown instead.
   const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
   at("map").hidden = at("map-tools").hidden = isEmpty;
@@ -442,21 +436,15 @@ function showKey() {
       ? `No path: ${view.no_path}.` : "No path: which topic says where the robot is? Choose it above."));
     return;
   }
-  at("map-key").replaceChildren(...(apart(view) ? [
-    ...map.paths.map((each, n) => one(ofPath(n), each.name)),
-    ...view.paths.filter((each) => each.error).map((each) => el("span", { class: "warn" },
-      "no path of ", bdi(each.name), `: ${each.error}`)),
-    ...(left ? [el("span", { class: "warn" }, `${counted(left, "more path")} left out`)] : [])]
-    : pathKey(view, one)),
+  const { path } = map;
+  at("map-key").replaceChildren(...pathKey(view, one),
   ...(map.stops.length ? [one("stood", `stops, ${map.stops.length}${stops > map.stops.length ? ` of ${stops}` : ""}`)]
     : []),
   ...(map.things.length ? [one("seen", `things, ${map.things.length}${more}`)] : []),
   ...((view.places || []).length ? [one("place", "places")] : []),
-  ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame || "without a name"))] : []),
-  ...(map.paths.some((each) => !each.whole)
-    ? [el("span", { class: "warn" }, "older path is being read")] : []),
-  ...(map.paths.some((each) => (map.exactly(each) || { exact: true }).exact === false)
-    ? [el("span", {}, "older parts to 5 cm")] : []),
+  ...(path ? [el("span", {}, "frame ", bdi(path.frame || "without a name"))] : []),
+  ...(path && !path.whole ? [el("span", { class: "warn" }, "older path is being read")] : []),
+  ...((map.exactly() || { exact: true }).exact === false ? [el("span", {}, "older parts to 5 cm")] : []),
   ...(view.no_path ? [el("span", { class: "warn" }, `${view.no_path}.`)] : []));
 }
 function pathKey(view, one) {

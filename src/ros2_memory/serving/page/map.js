@@ -33,26 +33,21 @@ function continuedBy(known, more) {
       .map((each) => each - first + known.t.length)] };
 }
 
-const ofPath = (n) => (n ? `path-${n + 1}` : "path");
-const apart = (view) => Boolean(view.paths && view.paths.length);
-
 class RobotMap {
-  /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(path, box, since): the path is
-     to be drawn more exactly; `since`: what is known of it reaches so far, else null. */
+  /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(box, since): the path is to
+     be drawn more exactly; `since`: what is known of it reaches so far, else null. */
   constructor(canvas, told) {
     this.canvas = canvas;
     this.told = told;
     this.draw = eachFrame(() => this.drawn());
     this.view = null;
-    this.exact = new Map();  // by name: the path as it was driven in a part of the map
+    this.exact = null;  // the path as it was driven in a part of the map
     this.fits = true;
     this.centre = { x: 0, y: 0 };
     this.scale = 40;
-    this.paths = [];
-    this.isApart = false;
+    this.path = null;
     this.t = null;
     this.moment = null;
-    this.moments = [];
     this.chosen = null;
     pointers(canvas, {
       hover: (x, y, event) => this.hover(x, y, event),
@@ -69,17 +64,12 @@ class RobotMap {
   show(view) {
     this.view = view;
     const path = view.path;
-    // Of several robots each has a path of its own.
-    this.isApart = apart(view);
-    this.paths = this.isApart ? view.paths.filter((each) => each.t) : path ? [path] : [];
-    for (const each of this.paths) {
-      each.starts = new Set(each.begins);
-      each.of = view.of;
-    }
+    this.path = path;
+    if (path) Object.assign(path, { starts: new Set(path.begins), of: view.of });
     this.things = view.things.filter((each) => path && each.frame === path.frame);
     this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
-    const driven = this.isApart ? `paths of ${this.paths.map((each) => plain(each.name)).join(", ")}`
-      : path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame || "a frame without a name")}` : "no path";
+    const driven = path
+      ? `${far(view.distance_m || 0)} driven in ${plain(path.frame || "a frame without a name")}` : "no path";
     this.canvas.setAttribute("aria-label", `Map: ${driven}, ${counted(this.stops.length, "stop")}, `
       + `${counted(this.things.length, "thing")}. Arrow keys move it, plus and minus zoom.`);
     this.draw();
@@ -93,38 +83,33 @@ class RobotMap {
     return { x0: low.x, y0: low.y, x1: to.x, y1: to.y, pixel: 1 / this.scale };
   }
   /* The path as it was driven, if it is known for all that is in sight; else null. */
-  exactly(path) {
-    const found = this.exact.get(path.name || "");
-    if (!found || found.frame !== path.frame || found.of !== path.of) return null;
+  exactly() {
+    const { exact: found, path } = this;
+    if (!found || !path || found.frame !== path.frame || found.of !== path.of) return null;
     const [low, to] = [this.world(0, this.canvas.clientHeight), this.world(this.canvas.clientWidth, 0)];
     const { box } = found;
     const isIn = box.x0 <= low.x && box.y0 <= low.y && box.x1 >= to.x && box.y1 >= to.y;
     return isIn && box.pixel * this.scale <= LARGER ? found : null;
   }
-  /* What a path is drawn by. */
-  shapeOf(path) { return this.exactly(path) || path; }
-  enlarge(path, box, reply, since) {
-    const known = since === null ? null : this.exact.get(path.name || "");
-    const found = known ? continuedBy(known, reply) : reply;
-    this.exact.set(path.name || "", { ...found, box, of: path.of, name: path.name, starts: new Set(found.begins) });
+  enlarge(box, reply, since, of) {
+    const found = since !== null && this.exact ? continuedBy(this.exact, reply) : reply;
+    this.exact = { ...found, box, of, starts: new Set(found.begins) };
     if (this.t !== null) this.place(this.t);
     this.draw();
   }
   /* Asks for what is drawn too coarsely. */
   getCloser() {
-    const box = this.box();
-    for (const path of this.paths) {
-      const found = this.exactly(path);
-      if (path.t.length < 2) continue;
-      if (!found) this.told.closer(path, box, null);
-      else if (path.t.at(-1) - found.until > NEWER_S) this.told.closer(path, found.box, found.until);
-    }
+    const { path } = this;
+    if (!path || path.t.length < 2) return;
+    const found = this.exactly();
+    if (!found) this.told.closer(this.box(), null);
+    else if (path.t.at(-1) - found.until > NEWER_S) this.told.closer(found.box, found.until);
   }
 
   /* Where the robot was at a time: between two poses, or at one shortly before; on what is drawn. */
-  at(t, path = this.isApart ? null : this.paths[0]) {
-    const on = this.between(t, path);
-    const shape = on && this.exactly(path);
+  at(t) {
+    const on = this.between(t);
+    const shape = on && this.exactly();
     if (!shape) return on;
     const n = lastBefore(shape.t, t);
     if (n < 0 || n + 1 >= shape.t.length || shape.starts.has(n + 1)) return on;
@@ -132,7 +117,8 @@ class RobotMap {
     return { yaw: on.yaw, x: shape.x[n] + (shape.x[n + 1] - shape.x[n]) * share,
       y: shape.y[n] + (shape.y[n + 1] - shape.y[n]) * share, isExact: true };
   }
-  between(t, path) {
+  between(t) {
+    const { path } = this;
     if (!path) return null;
     const n = lastBefore(path.t, t);
     if (n < 0) return null;
@@ -151,13 +137,12 @@ class RobotMap {
   place(t) {
     this.t = t;
     this.moment = t === null ? null : this.at(t);
-    this.moments = t === null || !this.isApart ? [] : this.paths.map((each) => this.at(t, each));
     this.draw();
   }
   /* Puts it where an answer has it: between points of a long path it is not known. */
   correct(answer) {
-    const [path] = this.paths;
-    if (!answer.robot || this.isApart || !path || answer.frame !== path.frame
+    const { path } = this;
+    if (!answer.robot || !path || answer.frame !== path.frame
       || (this.moment && this.moment.isExact)) return;
     this.moment = { x: answer.robot.x, y: answer.robot.y, yaw: answer.robot.yaw_deg };
     this.draw();
@@ -213,11 +198,12 @@ class RobotMap {
     }
     return best;
   }
-  /* The path and the time at which it is nearest to a point of the canvas, if it is near. */
+  /* The time at which the path is nearest to a point of the canvas; null if it is not near. */
   timeNear(x, y) {
-    let best = { t: null };
+    let best = null;
     let least = NEAR_PX;
-    for (const path of this.paths.map((each) => this.shapeOf(each))) for (let n = 0; n < path.t.length; n++) {
+    const path = this.exactly() || this.path;
+    for (let n = 0; path && n < path.t.length; n++) {
       const last = n + 1 === path.t.length || path.starts.has(n + 1);
       const to = last ? n : n + 1;
       const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
@@ -225,7 +211,7 @@ class RobotMap {
       const square = dx * dx + dy * dy;
       const share = square ? clamp(((x - ax) * dx + (y - ay) * dy) / square, 0, 1) : 0;
       const away = Math.hypot(ax + dx * share - x, ay + dy * share - y);
-      if (away <= least) { least = away; best = { t: path.t[n] + (path.t[to] - path.t[n]) * share, path }; }
+      if (away <= least) { least = away; best = path.t[n] + (path.t[to] - path.t[n]) * share; }
     }
     return best;
   }
@@ -243,9 +229,9 @@ class RobotMap {
       this.told.time(stop.t ?? null, false);
       return;
     }
-    const { t, path } = this.timeNear(x, y);
+    const t = this.timeNear(x, y);
     const place = t === null ? this.placeAt(x, y) : null;
-    tip(place ? place.name : t === null ? "" : `${this.isApart ? `${path.name}, ` : ""}${clock(t)}`, event);
+    tip(place ? place.name : t === null ? "" : clock(t), event);
     this.told.time(t, false);
   }
   click(x, y) {
@@ -253,7 +239,7 @@ class RobotMap {
     if (thing) { this.told.thing(thing); return; }
     const stop = this.near(this.stops || [], x, y);
     if (stop) { this.told.stretch(stop); return; }
-    const { t } = this.timeNear(x, y);
+    const t = this.timeNear(x, y);
     if (t !== null) this.told.time(t, true);
   }
 
@@ -262,10 +248,10 @@ class RobotMap {
     const xs = [];
     const ys = [];
     const add = (x, y) => { xs.push(x); ys.push(y); };
-    const { places = [], robot } = this.view;
-    for (const path of this.paths) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
+    const { places = [], robot, path } = this.view;
+    if (path) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
     for (const each of [...this.things, ...this.stops]) add(each.x, each.y);
-    if (robot && this.paths.length && !xs.length) add(robot.x, robot.y);
+    if (robot && path && !xs.length) add(robot.x, robot.y);
     for (const each of places) {
       if (each.circle) {
         const [x, y, r] = each.circle;
@@ -293,14 +279,10 @@ class RobotMap {
     this.drawPath(c);
     this.drawStops(c);
     this.drawNames(c, width, height, this.drawThings(c, width, height));
-    const { robot } = this.view;
-    if (this.isApart) {
-      this.moments.forEach((each, n) => each && this.drawRobot(c, each, colour(ofPath(n)), true));
-    } else if (robot && this.paths.length) {
-      this.drawRobot(c, robot, colour("now"), this.moment === null);
-    }
+    const { robot, path } = this.view;
+    if (robot && path) this.drawRobot(c, robot, colour("now"), this.moment === null);
     if (this.moment) this.drawRobot(c, this.moment, colour("robot"), true);
-    if (!this.paths.some((each) => each.t.length) && !this.view.no_path) {
+    if (!(path && path.t.length) && !this.view.no_path) {
       c.fillStyle = colour("soft");
       c.textAlign = "center";
       c.fillText("No poses in this time.", width / 2, height / 2);
@@ -358,7 +340,7 @@ class RobotMap {
       { x: x - r, y: y - r, w: 2 * r, h: 2 * r });
     for (const each of this.stops) mark(this.px(each.x), this.py(each.y), 5);
     for (const each of things) mark(each.px, each.py, 6);
-    if (robot && this.paths.length) mark(this.px(robot.x), this.py(robot.y), 12);
+    if (robot && this.path) mark(this.px(robot.x), this.py(robot.y), 12);
     const boxes = [...taken.values()];
     const named = (text, ink, w, spots) => {
       const box = spots.map(([x, y]) => ({ x, y, w, h: 14 }))
@@ -417,20 +399,18 @@ class RobotMap {
     return Boolean(chosen && chosen.label === thing.label && chosen.x === thing.x && chosen.y === thing.y);
   }
   drawPath(c) {
-    this.paths.forEach((path, index) => {
-      c.strokeStyle = colour(ofPath(index));
-      // What lies below others shows on both sides of them.
-      c.lineWidth = 1 + this.paths.length - index;
-      c.beginPath();
-      const exact = this.exactly(path);
-      if (exact) this.trace(c, exact, 0);
-      const until = exact ? exact.until : null;
-      const newer = until === null ? 0 : lastBefore(path.t, until + SAME_S) + 1;
-      // It goes on from where the exact one ends: a line from a pose before that would cut corners.
-      const [end, last] = exact && exact.t.length ? [exact, exact.t.length - 1] : [path, newer - 1];
-      this.trace(c, path, newer, last < 0 ? null : [end.x[last], end.y[last]]);
-      c.stroke();
-    });
+    const { path } = this;
+    if (!path) return;
+    c.strokeStyle = colour("path");
+    c.lineWidth = 2;
+    c.beginPath();
+    const exact = this.exactly();
+    if (exact) this.trace(c, exact, 0);
+    const newer = exact ? lastBefore(path.t, exact.until + SAME_S) + 1 : 0;
+    // It goes on from where the exact one ends: a line from a pose before that would cut corners.
+    const [end, last] = exact && exact.t.length ? [exact, exact.t.length - 1] : [path, newer - 1];
+    this.trace(c, path, newer, last < 0 ? null : [end.x[last], end.y[last]]);
+    c.stroke();
   }
   /* A path from a pose on; the line to that comes from `before`, if it is not where a part begins. */
   trace(c, path, first, before = null) {

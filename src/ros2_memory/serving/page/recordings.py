@@ -8,21 +8,15 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory.bag_dir.layout import is_kept_apart
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened, similar
-from ros2_memory.core.timebase import Ns, unix_from_ns
-from ros2_memory.history.robots import (
-    ADVICE,
-    contradicting_frames,
-    describe_mixed,
-    mixed_recordings,
-)
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.robots import ADVICE, describe_mixed
 from ros2_memory.index.recordings import name_of, recordings_of
-from ros2_memory.serving.page.span import path_in
 
 if TYPE_CHECKING:
-    from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
@@ -30,8 +24,6 @@ if TYPE_CHECKING:
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""
-MOST_PATHS: Final = 6
-"""Colours that can be told apart on one map."""
 _MOST_MEMORIES: Final = 16
 """Memories of single recordings that are cached."""
 
@@ -66,28 +58,6 @@ class Recordings:
             "mixed": [note.removesuffix(ADVICE) for note in describe_mixed(chosen, call)],
         }
 
-    def paths(self, chosen: Memory, call: Call, window: TimeWindow) -> JsonObject:
-        """Returns a path for each robot if recordings are plainly of several robots; else none.
-
-        A robot is one recording, or a folder of recordings that do not overlap each other. The
-        newest `MOST_PATHS` robots have a path, by name.
-        """
-        names = _robots(chosen, call, window)
-        robot_paths: list[JsonValue] = []
-        for name in sorted(names[:MOST_PATHS]):
-            try:
-                alone = self.alone(name)
-                limits = replace(alone.limits, pose_topic=chosen.limits.pose_topic)
-                path = path_in(replace(alone, limits=limits), call, window)
-            except QueryTimeoutError as error:
-                robot_paths.append({"name": name, "error": str(error), "late": True})
-            except EpisodicError as error:
-                robot_paths.append({"name": name, "error": str(error)})
-            else:
-                if path is not None:
-                    robot_paths.append({"name": name, **path})
-        return {"paths": robot_paths, "paths_left_out": len(names[MOST_PATHS:])}
-
     def _list(self) -> list[JsonObject]:
         index = self._memory.index
         return _rows(index.published or index.snapshot(), str(index.bag_dir))
@@ -118,46 +88,6 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
             row = _row(folder, [*chain.from_iterable(recordings)])
             rows.append({**row, "holds": len(recordings)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
-
-
-def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
-    """Returns the names of robots in a window, the newest first; none unless there are several.
-
-    There are several if recordings overlap in time, or have contradicting frames. A folder of
-    recordings is one robot. If its recordings overlap each other, each recording is one.
-    """
-    root, ends = str(memory.index.bag_dir), dict[str, Ns]()
-    for path, bags in recordings_of(memory.index.snapshot()).items():
-        if any(bag.reaches_into(window) for bag in bags):
-            ends[name_of(path, bags, root)] = max(bag.end for bag in bags)
-    is_mixed = False
-    folders_with_overlaps: set[str] = set()
-    for pair, topic in mixed_recordings(memory, call):
-        if topic is not None and window.overlaps(pair.start, pair.end):
-            is_mixed = True
-            first, second = (
-                _folder(str(path).removeprefix(f"{root}/")) for path in (pair.first, pair.second)
-            )
-            if first == second:
-                folders_with_overlaps.add(first)
-    if not is_mixed and not _has_contradictions(memory, call, {*map(_folder, ends)}):
-        return []
-    robots: dict[str, Ns] = {}
-    for name, end in ends.items():
-        folder = _folder(name)
-        robot = name if folder in folders_with_overlaps else folder
-        robots[robot] = max(end, robots.get(robot, end))
-    return sorted(robots, key=lambda robot: (robots[robot], robot), reverse=True)
-
-
-def _has_contradictions(memory: Memory, call: Call, folders: set[str]) -> bool:
-    """Returns whether recordings of two of these folders have contradicting frames."""
-    root = str(memory.index.bag_dir)
-    for contradiction in contradicting_frames(memory, call):
-        involved = {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
-        if len(involved) > 1 and involved <= folders:
-            return True
-    return False
 
 
 def _folder(name: str) -> str:

@@ -120,9 +120,6 @@ class _PageData:
             shown |= self._recordings.shown(part, call)
             if given.get("named") == "1":
                 shown["memory"] = memory_name(self._memory)
-        if shown.get("mixed") and "path" in shown:
-            window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
-            shown |= self._recordings.paths(part, call, window)
         return shown
 
 

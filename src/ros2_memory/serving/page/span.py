@@ -369,16 +369,6 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Part:
     return Part({"path": _path_points(path), "robot": robot, "places": places}, tuple(notes))
 
 
-def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
-    """Returns the path in a window; None if no topic with poses is recorded.
-
-    Raises:
-        QueryTimeoutError: it is not known within the time of a quick answer.
-    """
-    path = robot_path(View(memory, call.within(_QUICK_S), window.stop), window)
-    return None if path is None else _path_points(path)
-
-
 def _path_points(path: RobotPath) -> JsonObject:
     """Returns at most `MOST_POINTS` points of a path as columns, as near to the path as they can.
 
