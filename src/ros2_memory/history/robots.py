@@ -24,12 +24,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
-from ros2_memory.index.recordings import (
-    Overlapping,
-    loose_bags_beside_others,
-    overlapping_recordings,
-    recordings_of,
-)
+from ros2_memory.index.recordings import loose_bags_beside_others, recordings_of
 from ros2_memory.index.segment import TopicExtent, wider
 from ros2_memory.index.split_order import split_of
 
@@ -46,11 +41,11 @@ _SLOW_NS: Final = 600 * NS_PER_S
 _TRIED: Final = 7
 """So many messages are looked for in the other recording: a subscriber may miss some."""
 _MAX_PAIRS: Final = 20
-"""At most so many pairs of recordings are compared."""
+"""At most so many pairs of recordings are compared for the whole memory."""
 _MAX_TOPICS: Final = 3
 """At most so many topics of a question are compared."""
 _MAX_COMPARED: Final = 8
-"""At most so many topics of a pair are compared: robots may share some (`/clock`, a map)."""
+"""At most so many topics are compared for the whole memory: robots may share some (`/clock`)."""
 _MAX_TREES: Final = 32
 """The static transforms of so many recordings are compared, the newest."""
 _MAX_STATIC: Final = 50
@@ -61,77 +56,13 @@ _OWN: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that the recorder of the bag directory made."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: by path of a closed recording, the parent of each static frame."""
-SET_BACK: Final = "the clock was set back between recordings"
-"""Begins a sentence on recordings that one recorder made, and that overlap in time."""
+_LONG_NS: Final = 30 * NS_PER_S
+"""A shorter overlap at the ends of two recordings is named in the answers that it touches alone."""
 ADVICE: Final = "; data.recording selects one recording"
 """Ends a sentence on mixed robots."""
 _RECENT_NS: Final = 60 * NS_PER_S
 _DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
 """Of a memory: when `describe_mixed` last checked, and its sentences."""
-
-
-class Mixed(NamedTuple):
-    """Two recordings that overlap in time, and a topic on which they have different messages.
-
-    `topic` is None if no such topic was found.
-    """
-
-    pair: Overlapping
-    topic: str | None
-
-
-class Contradiction(NamedTuple):
-    """Two recordings, by their paths, in which a frame has different parents."""
-
-    recordings: tuple[str, str]
-    frame: str
-    parents: tuple[str, str]
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """The names of the two recordings."""
-        first, other = self.recordings
-        return Overlapping(Path(first), Path(other), 0, 0).names
-
-    def __str__(self) -> str:
-        """Returns a sentence, without a full stop."""
-        first, other = self.names
-        return (
-            f"the frame {self.frame} is in {self.parents[0]} in the recording {first}, and in "
-            f"{self.parents[1]} in {other}, as of two robots"
-        )
-
-
-def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
-    """Returns the recordings that overlap in time, with a topic on which they differ.
-
-    The index knows the overlaps. Messages of the first `_MAX_PAIRS` are compared, unless the clock
-    was set back during one of the recordings: that makes an overlap without a second robot.
-    """
-    view = View(memory, call)  # its notes belong to no answer
-    mixed: list[Mixed] = []
-    pairs = overlapping_recordings(view.snapshot, memory.index.joined_with)
-    if not pairs:
-        return ()
-    bags, steps = recordings_of(view.snapshot), _steps_back(view)
-    for pair in pairs:
-        by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
-        topic: str | None = None
-        if not by_clock and len(mixed) < _MAX_PAIRS:
-            try:
-                topic = _differing_topic(view, pair, bags)
-            except QueryTimeoutError:
-                break
-        mixed.append(Mixed(pair, topic))
-    return tuple(mixed)
-
-
-def are_of_one_recorder(memory: Memory, pair: Overlapping) -> bool:
-    """Whether the recorder of the bag directory made both recordings, one after the other.
-
-    Then they overlap because the clock was set back.
-    """
-    return _own_recordings(memory.index.bag_dir).issuperset((pair.first, pair.second))
 
 
 def _own_recordings(bag_dir: Path) -> frozenset[Path]:
@@ -140,29 +71,6 @@ def _own_recordings(bag_dir: Path) -> frozenset[Path]:
         return frozenset(bag_dir / name for name in OwnRecordings(bag_dir).in_order())
     except OSError:
         return frozenset()
-
-
-def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
-    """Returns the static frames that have different parents in two recordings, each frame once."""
-    view = View(memory, call)
-    remembered = memory.memo.of(_PARENTS, dict)
-    trees: dict[str, Mapping[str, str]] = {}
-    for path, bags in _recordings_to_compare(view):
-        try:
-            parents = remembered.get(path) or _static_parents(view, bags)
-        except QueryTimeoutError:
-            break
-        if not any(bag.state is BagState.ACTIVE for bag in bags):
-            remembered[path] = parents
-        trees[path] = parents
-    contradictions: dict[str, Contradiction] = {}
-    for (first, parents), (other, other_parents) in combinations(trees.items(), 2):
-        for frame in sorted(parents.keys() & other_parents.keys()):
-            parent, other_parent = parents[frame], other_parents[frame]
-            if parent != other_parent and frame not in contradictions:
-                both = (parent, other_parent)
-                contradictions[frame] = Contradiction((first, other), frame, both)
-    return tuple(contradictions.values())
 
 
 def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
@@ -174,59 +82,74 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
     for described_at, sentences in described:
         if abs(now - described_at) <= _RECENT_NS:
             return sentences
-    sentences = tuple(_mixed_sentences(memory, call))
+    sentences = tuple(_mixed_sentences(View(memory, call)))  # its notes belong to no answer
     described[:] = [(now, sentences)]
     return sentences
 
 
-def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
-    differing = [mixed for mixed in mixed_recordings(memory, call) if mixed.topic is not None]
-    by_clock = [mixed for mixed in differing if are_of_one_recorder(memory, mixed.pair)]
-    robots = [mixed for mixed in differing if mixed not in by_clock]
-    if robots:
-        yield _describe_overlaps("robots are mixed", robots, "answers treat them as one robot")
-    if by_clock:
-        yield _describe_overlaps(SET_BACK, by_clock, "one recorder made them, one after the other")
-    contradictions = contradicting_frames(memory, call)
+def _mixed_sentences(view: View) -> Iterator[str]:
+    yield from _overlap_sentences(view)
+    contradictions = [*_contradicting_frames(view)]
     if contradictions:
         more = len(contradictions) - 1
         yield f"robots are mixed: {contradictions[0]}{f' (and {more} more)' if more else ''}"
 
 
-def _describe_overlaps(what: str, overlapping: Sequence[Mixed], but: str) -> str:
-    names = sorted({name for mixed in overlapping for name in mixed.pair.names})
-    first = overlapping[0]
-    return (
-        f"{what}: {listed(names)} overlap in time (from {iso_local(first.pair.start)}), each "
-        f"with different messages on {first.topic}, but {but}{ADVICE}"
-    )
+def _overlap_sentences(view: View) -> Iterator[str]:
+    """Yields a sentence on recordings with different messages at the same time, if there are any.
+
+    It is about the first topic on which several robots show, or else about a long overlap that a
+    clock explains. The robot's own topics come first, of which only some pairs are compared.
+    """
+    by_clock: list[str] = []
+    for topic in islice(_shared_topics(view), _MAX_COMPARED):
+        parallel = _parallel_recordings(view, topic, TimeWindow.everything(), _MAX_PAIRS) or []
+        robots = [pair for pair in parallel if not pair.by_clock]
+        if robots:
+            yield (
+                f"robots are mixed: {listed(_recording_names(view, robots))} overlap in time (from "
+                f"{iso_local(robots[0].span.start)}), each with different messages on {topic}, but "
+                f"answers treat them as one robot{ADVICE}"
+            )
+            return
+        long_ones = (pair for pair in parallel if pair.span.stop - pair.span.start > _LONG_NS)
+        by_clock += (pair.describe_by_clock(topic) for pair in long_ones)
+    if by_clock:
+        yield f"recordings overlap in time: {by_clock[0]}"
 
 
-def _differing_topic(
-    view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
-) -> str | None:
-    """Returns a topic on which two recordings have different messages; the robot's own first."""
-    both = TimeWindow(pair.start, pair.end + 1)
-    first, second = (
-        [bag for bag in recordings.get(str(path), ()) if bag.reaches_into(both)]
-        for path in (pair.first, pair.second)
-    )
-    shared = (_topics_of(first) & _topics_of(second)) - view.timeline.transient_local
-    of_robot = [topic for topic in (view.pose_topic, *view.limits.tf_topics) if topic in shared]
-    for topic in islice([*of_robot, *sorted(shared.difference(of_robot))], _MAX_COMPARED):
-        extents = _bag_extents(first, topic), _bag_extents(second, topic)
-        if _bags_differ(view, topic, extents, both):
-            return topic
-    return None
+def _shared_topics(view: View) -> Iterator[str]:
+    """Yields the topics that several recordings hold, those of the robot's poses first."""
+    recorded = view.timeline.topics()
+    of_robot = [view.pose_topic, *view.limits.tf_topics]
+    for topic in dict.fromkeys([*of_robot, *sorted(recorded)]):
+        is_latched = topic in view.timeline.transient_local
+        if topic in recorded and not is_latched and len(_recordings_with(view, topic)) > 1:
+            yield topic
 
 
-def _topics_of(bags: Sequence[BagFile]) -> set[str]:
-    return {topic for bag in bags for topic in bag.summary.schema.positions}
-
-
-def _bag_extents(bags: Sequence[BagFile], topic: str) -> list[TopicExtent]:
-    holding = (bag for bag in bags if topic in bag.summary.schema.positions)
-    return [TopicExtent(bag, *bag.summary.span_of((topic,))) for bag in holding]
+def _contradicting_frames(view: View) -> Iterator[str]:
+    """Yields a sentence on each static frame that has different parents in two recordings."""
+    remembered = view.memory.memo.of(_PARENTS, dict)
+    trees: dict[str, Mapping[str, str]] = {}
+    for path, bags in _recordings_to_compare(view):
+        try:
+            parents = remembered.get(path) or _static_parents(view, bags)
+        except QueryTimeoutError:
+            break
+        if not any(bag.state is BagState.ACTIVE for bag in bags):
+            remembered[path] = parents
+        trees[path] = parents
+    contradicting: set[str] = set()
+    for (first, parents), (other, others) in combinations(trees.items(), 2):
+        for frame in sorted(parents.keys() & others.keys() - contradicting):
+            if parents[frame] != others[frame]:
+                contradicting.add(frame)
+                yield (
+                    f"the frame {frame} is in {parents[frame]} in the recording "
+                    f"{_name(view, first)}, and in {others[frame]} in {_name(view, other)}, as of "
+                    "two robots"
+                )
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
@@ -254,7 +177,8 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     parents: dict[str, str] = {}
     window = TimeWindow.everything()
     for topic in view.limits.tf_static_topics:
-        spans = _bag_extents(bags, topic)
+        holding = (bag for bag in bags if topic in bag.summary.schema.positions)
+        spans = [TopicExtent(bag, *bag.summary.span_of((topic,))) for bag in holding]
         merged = view.stream.merged(spans, [topic], window) if spans else ()
         for stored in islice(merged, _MAX_STATIC):
             message = view.bags.decode(stored)
@@ -273,9 +197,9 @@ class ParallelRecordings(NamedTuple):
         first: the recording that holds the topic first.
         other: the other one.
         span: when both hold the topic.
-        by_clock: whether a clock that was set back explains it: between the two recordings (the
-            span is the end of the first and the begin of the other, and less than half of each), or
-            during one of them (the span is no longer than the step); or one recorder made both.
+        by_clock: whether a wrong clock explains it: the span is the end of the first and the begin
+            of the other, and less than half of each; or one of them has a wrong date; or one
+            recorder made both, one after the other.
         bags: the files of the other recording that overlap the first; empty for all in its folder.
     """
 
@@ -314,7 +238,9 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     parallel = parallel_or_twice(view, topic, window)
     # A path by transforms uses all recordings at once: it cannot follow one of them.
     by_transforms = topic in view.limits.tf_topics
-    names = _recording_names([pair for pair in parallel if by_transforms or not pair.by_clock])
+    names = _recording_names(
+        view, [pair for pair in parallel if by_transforms or not pair.by_clock]
+    )
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
@@ -333,7 +259,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     Returns these times, without the overlaps of two recordings that a clock explains.
     """
     parallel = parallel_or_twice(view, topic, window)
-    names = _recording_names([pair for pair in parallel if not pair.by_clock])
+    names = _recording_names(view, [pair for pair in parallel if not pair.by_clock])
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
@@ -346,8 +272,14 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     return united((span.start, span.stop) for span in spans)
 
 
-def _recording_names(pairs: Sequence[ParallelRecordings]) -> list[str]:
-    return sorted({path.name for pair in pairs for path in (pair.first, pair.other)})
+def _recording_names(view: View, pairs: Sequence[ParallelRecordings]) -> list[str]:
+    paths = {path for pair in pairs for path in (pair.first, pair.other)}
+    return sorted(_name(view, str(path)) for path in paths)
+
+
+def _name(view: View, path: str) -> str:
+    """Returns the name of a recording: its path in the bag directory."""
+    return path.removeprefix(f"{view.bag_dir}/")
 
 
 def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
@@ -381,17 +313,18 @@ def recordings_apart(
 
 
 def _parallel_recordings(
-    view: View, topic: str, window: TimeWindow
+    view: View, topic: str, window: TimeWindow, most_pairs: int | None = None
 ) -> list[ParallelRecordings] | None:
     """Returns the recordings with different messages on a topic at the same time.
 
-    None if the call's time is over before that is known, or if a lake does not hold the messages.
+    Of many pairs the first `most_pairs` are compared. None if the call's time is over before it is
+    known, or if a lake does not hold the messages.
     """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.so_far()
     try:
-        for parallel in _overlapping_pairs(view, topic, window):
+        for parallel in islice(_overlapping_pairs(view, topic, window), most_pairs):
             pair = parallel.first, parallel.other
             # Several robots in one folder have thousands of pairs: each recording is enough once.
             is_known = not parallel.by_clock and apart.issuperset(pair)
@@ -429,12 +362,12 @@ class _TopicSpan(NamedTuple):
 
 
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
-    """Yields pairs of recordings that hold a topic at the same time in a window."""
+    """Yields pairs of recordings that hold a topic at the same time, and that no handover joins."""
     recordings = _recordings_with(view, topic)
     # A thinned day contains the bags of moments and rules of that day.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
-    steps = _steps_back(view)
+    own, misdated = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir)), _misdated(view)
     loose_files: dict[str, list[str]] = defaultdict(list)
     for file, recording in loose_bags_beside_others(view.snapshot).items():
         loose_files[recording].append(file)
@@ -444,16 +377,16 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
         for earlier in going_on:
             span = TimeWindow(later.first, min(later.last, earlier.last) + 1)
             is_there = earlier.last <= later.last or _has_bags_near(view, topic, earlier.path, span)
-            if is_there and window.overlaps(span.start, span.stop - 1):
-                step = max(steps[later.path], steps[earlier.path])
-                own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
+            is_asked = is_there and window.overlaps(span.start, span.stop - 1)
+            pair = earlier.path, later.path
+            if is_asked and not view.sessions.are_joined(*pair):
                 by_clock = (
                     _is_short_edge(earlier, later)
-                    or span.stop - 1 - span.start <= step
-                    or own.issuperset((earlier.path, later.path))
+                    or own.issuperset(pair)
+                    or not misdated.isdisjoint(pair)
                 )
                 bags = frozenset(loose_files.get(str(later.path), ()))
-                yield ParallelRecordings(earlier.path, later.path, span, by_clock, bags)
+                yield ParallelRecordings(*pair, span, by_clock, bags)
         going_on.append(later)
 
 
@@ -517,23 +450,18 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
             )
 
 
-def _steps_back(view: View) -> Mapping[Path, Ns]:
-    """Returns by recording the farthest step back of its clock (ns); 0 by default."""
-    steps: dict[Path, Ns] = defaultdict(int)
-    for fault in view.snapshot.dating.faults:
-        if fault.kind is FaultyClock.SET_BACK:
-            recording = _recording_of(fault.bag, loose_bags_beside_others(view.snapshot))
-            steps[recording] = max(fault.by, steps[recording])
-    return steps
+def _misdated(view: View) -> set[Path]:
+    """Returns the recordings with a bag that a wrong clock dated, or in which it was set back."""
+    faults = view.snapshot.dating.faults
+    loose = loose_bags_beside_others(view.snapshot) if faults else {}
+    return {_recording_of(fault.bag, loose) for fault in faults}
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
-    """Whether two recordings that no handover joins hold different messages in a window."""
+    """Whether two recordings hold different messages in a window."""
     remembered, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in remembered:
         return remembered[key]
-    if view.sessions.are_joined(*pair):
-        return False
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
     loose = loose_bags_beside_others(view.snapshot)

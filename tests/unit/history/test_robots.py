@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.memories import asked, memory_of, with_store
@@ -48,25 +49,28 @@ def driven(memory: Memory, start: int, stop: int) -> Any:
     return asked(memory, "trajectory_summary", **span)
 
 
-def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
-    return [(pair.names, topic) for pair, topic in mixed_recordings(memory, Call())]
-
-
 def warned(memory: Memory) -> list[str]:
     return [note for note in memory_status(memory, Call()).notes if "robots are mixed" in note]
 
 
-@pytest.mark.parametrize("names", [("red/red_0", "blue/blue_0"), ("both/red", "both/blue")])
+@pytest.mark.parametrize(
+    ("bags", "named"),
+    [
+        (("red/red_0", "blue/blue_0"), "blue, red"),
+        (("both/red", "both/blue"), "both/blue, both/red"),
+        (("red/run/run_0", "blue/run/run_0"), "blue/run, red/run"),
+    ],
+)
 def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
-    tmp_path: Path, names: tuple[str, str]
+    tmp_path: Path, bags: tuple[str, str], named: str
 ) -> None:
-    for number, name in enumerate(names):
+    for number, name in enumerate(bags):
         write_mcap(tmp_path / f"{name}.mcap", drive(10.0 * number))
     memory = memory_of(tmp_path)
-    assert differing(memory) == [(("blue", "red"), "/odom")]
     (note,) = warned(memory)
-    assert "blue, red overlap in time" in note
+    assert f"{named} overlap in time" in note
     assert "/odom" in note
+    assert named in driven(memory, 0, 60)["detail"]
     assert "robots are mixed (see notes)" in asked(memory, "memory_status")["doubts"]
 
 
@@ -80,9 +84,9 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     memory = memory_of(tmp_path)
     assert warned(memory) == []
     status = asked(memory, "memory_status")
-    assert status["doubts"] == "the clock was set back between recordings (see notes)"
-    (note,) = [note for note in status["notes"] if "one recorder made them" in note]
-    assert ", ".join(sorted(names)) in note
+    assert status["doubts"] == "recordings overlap in time (see notes)"
+    (note,) = [note for note in status["notes"] if "as after a clock was set back" in note]
+    assert all(name in note for name in names)
     path = asked(memory, "trajectory_summary", start=0, end=2 * T0_S)
     assert path["distance_m"] == pytest.approx(6.0, abs=0.1)
     assert "as after a clock was set back" in str(path["notes"])
@@ -185,7 +189,6 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     # What follows begins before the end of the first split by the same clock.
     write_mcap(tmp_path / "run_2" / "run_2_0.mcap", driving(61, 200, 61.0))
     memory = memory_of(tmp_path)
-    assert differing(memory) == [(("run_1", "run_2"), None)]
     assert warned(memory) == []
     told = driven(memory, 95, 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
@@ -216,8 +219,52 @@ def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
     write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
     write_mcap(tmp_path / "b" / "b_0.mcap", other)
     memory = memory_of(tmp_path)
-    assert differing(memory) == [(("a", "b"), None)]
+    status = memory_status(memory, Call())
+    assert not [note for note in status.notes if "overlap in time" in note]
+    for topic in ("/odom", "/chatter"):
+        ranged = asked(memory, "get_topic_in_range", topic=topic, **WINDOW)
+        assert "several robots" not in str(ranged.get("notes"))
+
+
+@pytest.mark.parametrize("side", ["previous", "next"])
+def test_however_long_a_handover_took_its_recordings_are_of_one_robot(
+    tmp_path: Path, side: str
+) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
+    write_mcap(tmp_path / "b" / "b_0.mcap", drive(10.0, begin=5))
+    assert len(warned(memory_of(tmp_path))) == 1
+    if side == "next":
+        write_handover(tmp_path / "a", Handover(next="b"))
+    else:
+        write_handover(tmp_path / "b", Handover(previous="a"))
+    assert warned(memory_of(tmp_path)) == []
+
+
+def test_two_robots_are_found_behind_however_many_handovers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(robots, "_MAX_PAIRS", 3)
+    for number in range(5):
+        name = f"a{number}"
+        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(0.0, begin=40 * number))
+        if number:
+            write_handover(tmp_path / name, Handover(previous=f"a{number - 1}"))
+    for number, name in enumerate("bc"):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(10.0 * number, begin=900))
+    (note,) = warned(memory_of(tmp_path))
+    assert "b, c overlap in time" in note
+
+
+def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> None:
+    for number in range(3):
+        name = f"boot_{number}"
+        poses = [odom((n + 1) * S, 5.0 * number, n / 10) for n in range(61)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
+    write_mcap(tmp_path / "set" / "set_0.mcap", drive(0.0))
+    memory = memory_of(tmp_path)
     assert warned(memory) == []
+    path = asked(memory, "trajectory_summary", start=0, end=70)
+    assert "as after a clock was set back" in str(path["notes"])
 
 
 def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
@@ -225,12 +272,6 @@ def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
     later = T0 + 3600 * S
     write_mcap(tmp_path / "blue" / "blue_0.mcap", [mounted("torso", later)])
     memory = memory_of(tmp_path)
-    (found,) = contradicting_frames(memory, Call())
-    assert (found.names, found.frame, found.parents) == (
-        ("red", "blue"),
-        "laser",
-        ("base_link", "torso"),
-    )
     (note,) = warned(memory)
     assert "laser is in base_link in the recording red, and in torso in blue" in note
 
@@ -273,6 +314,7 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
         poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
         write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
     memory = memory_of(tmp_path)
-    assert differing(memory) == [(("run_1", "run_2"), "/odom")]
+    (note,) = warned(memory)
+    assert "run_1, run_2 overlap in time" in note
     told = asked(memory, "trajectory_summary", start=0, end=61)
     assert told["reason"] == "mixed"

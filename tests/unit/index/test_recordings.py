@@ -1,7 +1,7 @@
 """Recordings of a bag directory: one alone, those that overlap or are one, and what is listed."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.spans import overlap_spans
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.index import listed_splits, recordings, timeline
+from ros2_memory.index import listed_splits, timeline
 from ros2_memory.index.listed_splits import Absent
-from ros2_memory.index.recordings import Overlapping, name_of, overlapping_recordings, recordings_of
+from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
@@ -81,48 +80,6 @@ def test_the_index_of_one_recording_has_no_other_than_that_which_it_is_made_of(
     assert found("deep", "deep/b") == found("deep/b", "deep") == ["deep/b/0.mcap"]
     assert found("run_0.mcap", "run") == found("run", "run_0") == ["run_0.mcap"]
     assert found("deep", "a") == found("deep/b", "deep/c") == found("run", "a") == []
-
-
-def robot(folder: Path, spans: Mapping[str, tuple[int, int]]) -> Memory:
-    """Bags of odometry at 1 Hz, by recording, from and until so many seconds."""
-    for recording, (first, last) in spans.items():
-        messages = [odom((T0 + at) * NS_PER_S, 0.0, 0.0) for at in range(first, last + 1)]
-        write_mcap(folder / recording / "0.mcap", messages)
-    return memory_of(folder)
-
-
-def overlapping(memory: Memory) -> tuple[Overlapping, ...]:
-    index = memory.index
-    return overlapping_recordings(index.refresh(), index.joined_with)
-
-
-def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]:
-    return [
-        (one.first.name, one.second.name, one.start / NS_PER_S - T0, one.end / NS_PER_S - T0)
-        for one in found
-    ]
-
-
-@pytest.mark.parametrize("side", ["previous", "next"])
-def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, side: str) -> None:
-    taken = robot(tmp_path, {"a": (0, 60), "b": (5, 60)})
-    assert len(overlapping(taken)) == 1
-    if side == "next":
-        write_handover(tmp_path / "a", Handover(next="b"))
-    else:
-        write_handover(tmp_path / "b", Handover(previous="a"))
-    assert overlapping(taken) == ()
-
-
-def test_two_robots_are_found_behind_however_many_handovers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recordings, "_MAX_READ", 3)
-    joined = {f"a{number}": (number * 10, number * 10 + 20) for number in range(5)}
-    taken = robot(tmp_path, {**joined, "b": (100, 150), "c": (100, 150)})
-    for number in range(1, 5):
-        write_handover(tmp_path / f"a{number}", Handover(previous=f"a{number - 1}"))
-    assert pairs(overlapping(taken)) == [("b", "c", 100.0, 150.0)]
 
 
 halves_of_seconds = st.integers(0, 120).map(lambda number: number * NS_PER_S // 2)
