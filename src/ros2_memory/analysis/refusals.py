@@ -7,7 +7,7 @@ answer "never" would be false.
 from __future__ import annotations
 
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.conditions import (
     Beyond,
@@ -21,7 +21,6 @@ from ros2_memory.analysis.conditions import (
     plain_text,
     positions,
 )
-from ros2_memory.core.text import abbreviate
 from ros2_memory.messages.conversions import Summary, names_beside
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
 
 _LISTED_PATHS: Final = 16
-"""How many dot-paths, or names, a sentence lists."""
+"""How many dot-paths a sentence lists."""
 
 
 def refusal_for(condition: Condition, value: JsonValue) -> str | None:
@@ -38,37 +37,24 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
 
     A field below an empty list or a null is never refused: other messages may have it.
     """
-    field = condition.field
-    if field is None:
-        if isinstance(condition.test, NearPosition):
-            return _refusal_for_position(value)
-        return _refusal_for_kind(condition, [value])
-    if _is_unknown_below(value, field):
-        return None
-    targets = at_field(value, field)
-    if not targets:
-        return _refusal_for_field(value, field)
+    field, targets = condition.field, [value]
+    if field is None and isinstance(condition.test, NearPosition):
+        return _refusal_for_position(value)
+    if field is not None:
+        if _is_unknown_below(value, field):
+            return None
+        targets = at_field(value, field)
+        if not targets:
+            return f"the values have no field {field!r}; their fields are: {_paths(value, field)}"
     return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
-
-
-def _refusal_for_field(value: JsonValue, field: str) -> str:
-    paths = ", ".join(_paths(value)) or "none"
-    refusal = f"the values have no field {field!r}; their fields are: {paths}"
-    named = ", ".join(map(str, names_beside(value, field)[:_LISTED_PATHS]))
-    return f"{refusal}; or an element of a list by its name: {named}" if named else refusal
 
 
 def _refusal_for_position(value: JsonValue) -> str | None:
     if any(True for _ in positions(value)) or _has_unknown_part(value):
         return None
-    if isinstance(value, dict) and value.keys() >= {"latitude", "longitude"}:
-        return (
-            "the values give latitude and longitude in degrees, and near_position compares metres: "
-            "ask with above or below on field latitude or longitude"
-        )
     return (
-        "the values have no position: near_position needs a topic that does, "
-        "or a field that leads to an object with x and y"
+        "the values have no position in metres: near_position needs a topic that does, or a field "
+        "that leads to an object with x and y; above and below compare latitude and longitude"
     )
 
 
@@ -84,52 +70,34 @@ def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> 
 
 def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
     """Returns a refusal if all leaves of the targets are of types that the test never takes."""
-    test, field = condition.test, condition.field
     kinds = {type(leaf) for target in targets for leaf in leaves(target)}
-    if isinstance(test, Contains) and test.is_number:
-        has_elements = field is not None and any(
-            True for target in targets for _ in leaves(target, in_objects=False)
-        )
-        if str in kinds or not kinds & {int, float} or has_elements:
-            return None
-        return (
-            "the values hold numbers and no text, and contains finds a number only as the value "
-            "of a field or as an element of its list: name that in field, or ask with equals"
-        )
-    wanted = _wanted_kinds(condition)
-    if wanted is None or not kinds or kinds & wanted.kinds:
+    wanted = _wanted_kinds(condition, targets)
+    if wanted is None or not kinds or kinds & wanted or any(map(_has_unknown_part, targets)):
         return None
-    if any(map(_has_unknown_part, targets)):
-        return None
-    where = "the values" if field is None else f"the values of field {field!r}"
-    name, example = ("texts", "a text") if str in kinds else ("numbers", "a number")
+    are, example = ("texts", "a text") if str in kinds else ("numbers", "a number")
     if kinds == {bool}:
-        name, example = "booleans", "true or false"
-    advice = "" if isinstance(test, Beyond) else f": the value must be {example}"
-    return f"{where} are {name}, and {wanted.reason}{advice}"
+        are, example = "booleans", "true or false"
+    advice = f": the value must be {example}"
+    if isinstance(condition.test, Beyond):
+        advice = ", and above and below compare numbers"
+    elif isinstance(condition.test, Contains) and condition.test.is_number:
+        advice = ", which contains looks for in a list or at one field: give field, or use equals"
+    where = "the values" if condition.field is None else f"the values of field {condition.field!r}"
+    return f"{where} are {are}{advice}"
 
 
-class _WantedKinds(NamedTuple):
-    """The types of leaves that may pass a test, and the reason as a refusal gives it."""
-
-    kinds: frozenset[type]
-    reason: str
-
-
-def _wanted_kinds(condition: Condition) -> _WantedKinds | None:
+def _wanted_kinds(condition: Condition, targets: Sequence[JsonValue]) -> frozenset[type] | None:
     """Returns the types of leaves that may pass; None if leaves of any type may."""
-    test = condition.test
+    test, has_field = condition.test, condition.field is not None
     if isinstance(test, Beyond):
-        reason = f"{'above' if test.above else 'below'} compares numbers"
-        return _WantedKinds(frozenset({int, float}), reason)
+        return frozenset({int, float})
     if isinstance(test, Equals) and not isinstance(test.value, str):
-        kind = "boolean" if isinstance(test.value, bool) else "number"
-        reason = f"{abbreviate(test.value)} is a {kind}"
-        return _WantedKinds(frozenset({bool, int, float}), reason)
-    text = plain_text(test)
-    if text is None or (condition.field is None and not isinstance(test, Equals)):
-        return None
-    return _WantedKinds(frozenset({str}), f"{abbreviate(text)} is a text")
+        return frozenset({bool, int, float})
+    if isinstance(test, Contains) and test.is_number:
+        elements = chain.from_iterable(leaves(target, in_objects=False) for target in targets)
+        return None if has_field and any(True for _ in elements) else frozenset({str})
+    is_of_leaves = has_field or isinstance(test, Equals)
+    return frozenset({str}) if is_of_leaves and plain_text(test) is not None else None
 
 
 def shows_field(value: JsonValue, dot_path: str) -> bool:
@@ -179,12 +147,18 @@ def _has_unknown_part(value: JsonValue) -> bool:
     return value is None
 
 
-def _paths(value: JsonValue) -> list[str]:
-    """Returns the dot-paths of a value, outermost first, as many as fit into a sentence."""
-    paths = list(dict.fromkeys(_dot_paths(value, "")))
-    paths.sort(key=lambda path: path.count("."))
-    more = len(paths) - _LISTED_PATHS
-    return [*paths[:_LISTED_PATHS], f"{more} more"] if more > 0 else paths
+def _paths(value: JsonValue, field: str) -> str:
+    """Returns the dot-paths of a value, outermost first, as many as fit into a sentence.
+
+    In place of an element with a name, as `field` may give one, they have all such names.
+    """
+    array = field.partition(".")[0]
+    named = [f"{array}.{name}" for name in names_beside(value, field)]
+    paths = sorted(dict.fromkeys(_dot_paths(value, "")), key=lambda path: path.count("."))
+    listed_paths = [*named, *paths]
+    more = len(listed_paths) - _LISTED_PATHS
+    shown = [*listed_paths[:_LISTED_PATHS], *([f"{more} more"] if more > 0 else [])]
+    return ", ".join(shown) or "none"
 
 
 def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:

@@ -243,7 +243,7 @@ LISTED = "position, orientation, position.x"
         # A field that values have or may have.
         *((ODOM, "equals", 1, field, None) for field in ("position", "position.x")),
         *(
-            (SEEN, "equals", 1, f"detections.{field}", "1 is a number: the value must be a text")
+            (SEEN, "equals", 1, f"detections.{field}", "are texts: the value must be a text")
             for field in ("label", "0.label")
         ),
         (SEEN, "equals", "1", "detections.label", None),
@@ -254,8 +254,8 @@ LISTED = "position, orientation, position.x"
         *((value, "near_position", HERE, None, None) for value in (ODOM, SEEN, NOTHING_SEEN)),
         ({"percentage": 0.5}, "near_position", HERE, None, "no position"),
         # A number is contained in a text, or in what a field names.
-        *((ODOM, "contains", number, None, "ask with equals") for number in (3, "3", 2.5)),
-        (ODOM, "contains", 3, "position", "ask with equals"),
+        *((ODOM, "contains", number, None, "use equals") for number in (3, "3", 2.5)),
+        (ODOM, "contains", 3, "position", "use equals"),
         (ODOM, "contains", 3, "position.x", None),
         (SEEN, "contains", 3, None, None),
         ({"data": []}, "contains", 3, None, None),
@@ -272,8 +272,8 @@ LISTED = "position, orientation, position.x"
             )
         ),
         # A limit is asked of numbers alone.
-        ({"value": "12"}, "above", 3, "value", "are texts, and above compares numbers"),
-        ({"value": True}, "below", 3, "value", "are booleans, and below compares numbers"),
+        ({"value": "12"}, "above", 3, "value", "are texts, and above and below compare numbers"),
+        ({"value": True}, "below", 3, "value", "are booleans, and above and below compare numbers"),
         ({"value": [None, True]}, "below", 3, "value", None),
         (ODOM, "above", 3, "position", None),
         (ODOM, "equals", "cup", None, "must be a number"),
