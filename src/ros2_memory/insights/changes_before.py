@@ -75,7 +75,6 @@ _MAX_LOG_CHARS: Final = 100
 _LEVELS: Final = ("ok", "warning", "error", "stale")
 _ACTIVE_GOAL: Final = frozenset({1, 2, 3})
 """Accepted, executing, canceling (action_msgs/msg/GoalStatus)."""
-_ROUTINE: Final = ("goal accepted", "goal succeeded")
 
 
 class _DatedChange(NamedTuple):
@@ -134,11 +133,6 @@ class ChangesBefore:
             if since <= length and not (without and text.startswith(without)):
                 changes[first, text] = PastChange(text, since)
         return tuple(sorted(changes.values(), key=lambda change: change.before))
-
-
-def is_routine(change: PastChange) -> bool:
-    """Returns whether a change is the begin of a goal, or its success."""
-    return change.text.endswith(_ROUTINE)
 
 
 def topics_with_changes(view: View) -> list[str]:
@@ -397,7 +391,6 @@ def recap_before(
         past[:_MOST_CHANGES],
         len(past[_MOST_CHANGES:]),
         changes.looked_at,
-        sum(_is_recorded(view, topic, window) for topic in view.timeline.topics()),
         robot,
         speed_mps,
         (*changes.state, *_charges(view, at)),

@@ -11,7 +11,6 @@ from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
 from heapq import nsmallest
-from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
@@ -42,7 +41,6 @@ from ros2_memory.insights.changes_before import (
     SLACK_NS,
     ChangesBefore,
     changes_in,
-    is_routine,
     recap_before,
 )
 from ros2_memory.insights.drive import Drive, Stop, drive_in
@@ -543,22 +541,16 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
 def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> dict[Event, int]:
     """Returns how many of the nearest changes before each event there is room for.
 
-    The nearest changes of all events come first, then the second nearest, and so on. Events whose
-    changes are all routine come last.
+    The nearest changes of all events come first, then the second nearest, and so on.
     """
     counts_shown = dict.fromkeys(changes_of_events, 0)
     chars_left = _MOST_CHARS
-    is_routine_event = {
-        event: all(map(is_routine, past)) for event, past in changes_of_events.items()
-    }
-    for is_last, nth in product((False, True), range(_MOST_CHANGES)):
+    for nth in range(_MOST_CHANGES):
         for event, past in changes_of_events.items():
             # An event whose nearer change had no room shows no farther one.
             has_next = len(past) > nth == counts_shown[event]
-            if is_routine_event[event] is not is_last or not has_next:
-                continue
-            size = len(past[nth].text) + _CHANGE_CHARS
-            if size <= chars_left:
+            size = len(past[nth].text) + _CHANGE_CHARS if has_next else 0
+            if has_next and size <= chars_left:
                 chars_left -= size
                 counts_shown[event] += 1
     return counts_shown

@@ -165,7 +165,6 @@ _CHANGES: Final = objects(keys("text", TENTHS_OF_S("s_before", "before")))
     PLAIN("more").if_any,
     objects(keys("text", TENTHS_OF_S("s_after", "after")))("after"),
     "looked_at",
-    PLAIN("recorded_topics", "recorded"),
     an_object(
         keys(POSE("robot"), NAME("frame_id", "robot.frame_id"), digits(3)("speed_mps").if_known)
     )("robot", itself_if("robot")).if_known,
@@ -180,7 +179,6 @@ class Before(AnswerWithNotes):
         changes: the nearest first.
         more: how many others there are.
         looked_at: the topics that would show a change and were recorded at the time.
-        recorded: how many topics were recorded at the time in all.
         robot: the pose of the robot; None if it is not known.
         speed_mps: from its pose topic.
         state: booleans, statuses that are not ok and the goal of each action, at that time.
@@ -192,7 +190,6 @@ class Before(AnswerWithNotes):
     changes: tuple[PastChange, ...]
     more: int
     looked_at: tuple[str, ...]
-    recorded: int
     robot: Pose | None
     speed_mps: float | None
     state: tuple[tuple[str, bool | str], ...]
