@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import IntervalTable, united_tables
-from ros2_memory.analysis.motion.standstills import SHORTEST_NS
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -195,7 +194,6 @@ def recap(
         distance_m=None,
         max_speed=None,
         stood=_standing_time(view, drive, end - start),
-        shortest_stop=SHORTEST_NS,
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
         throughout=tuple(sorted(things.throughout)),

@@ -100,7 +100,6 @@ def stood_at(
             (place.x, place.y),
             (),
             Pair(_total_s(place.this), _total_s(place.other)),
-            (_first_start(place.this), _first_start(place.other)),
         )
         for place in places
     ]
@@ -108,7 +107,3 @@ def stood_at(
 
 def _total_s(stands: Iterable[PlacedStandstill]) -> float:
     return unix_from_ns(sum(stand.duration for stand in stands))
-
-
-def _first_start(stands: Iterable[PlacedStandstill]) -> Ns | None:
-    return min((stand.start for stand in stands), default=None)

@@ -243,7 +243,6 @@ class Event:
     digits(3)("distance_m").in_short,
     digits(3)("max_speed"),
     SECONDS("stood_s").in_short,
-    SECONDS("shortest_stop_s"),
     an_object(keys("where", "visits", SECONDS("inside_s"))).spread("where", itself_if("where")),
     NAME("frame_id"),
     OBJECTS("events"),
@@ -262,10 +261,9 @@ class Recap(AnswerWithNotes):
         now: what ages count from.
         distance_m: length of the driven path; None without poses.
         max_speed: in m/s; None without poses.
-        stood: how long the robot stood in standstills of `shortest_stop` or longer. A standstill
+        stood: how long the robot stood in standstills that are no shorter than stops. A standstill
             counts as far as it is inside the window, so the times of successive windows add up.
             None without poses, and if they are too noisy or too few to know.
-        shortest_stop: shorter stops do not count.
         frame_id: of the places in texts.
         events: what happened, in order of time.
         throughout: things that a detector saw during the whole window at its usual rate.
@@ -284,7 +282,6 @@ class Recap(AnswerWithNotes):
     distance_m: float | None
     max_speed: float | None
     stood: Ns | None
-    shortest_stop: Ns
     frame_id: str | None
     events: tuple[Event, ...]
     throughout: tuple[str, ...]

@@ -153,7 +153,6 @@ def thing(most_stays: int) -> Keys:
     return keys(
         NAME("label").in_short,
         COUNTS_BY_NAME("labels").if_any,
-        NAMES("also_seen_as").if_any,
         NAMES("misread_as").if_any,
         PLAIN("moves").if_any.in_short,
         PLAIN("at_once").if_known.in_short,
@@ -184,7 +183,6 @@ class Thing:
 
     Attributes:
         label: its name.
-        also_seen_as: other spellings of the label, the commonest first.
         place: its last place (m), in `frame_id`.
         spread_m: root mean square distance of its detections from `place`.
         inside: the named places that it is in, the smallest first.
@@ -203,7 +201,6 @@ class Thing:
     """
 
     label: str
-    also_seen_as: tuple[str, ...]
     place: Vector3
     spread_m: float
     frame_id: str
@@ -399,13 +396,11 @@ class StandstillPlace(NamedTuple):
         place: x, y in metres.
         inside: the named places around it, the smallest first.
         seconds: for how long it stood there in each window.
-        since: when it first stood there in each window; None if it did not.
     """
 
     place: tuple[float, float]
     inside: tuple[str, ...]
     seconds: Pair
-    since: tuple[Ns | None, Ns | None]
 
 
 _STANDSTILLS: Final = objects(
@@ -413,9 +408,6 @@ _STANDSTILLS: Final = objects(
         _XY.spread("place"),
         INSIDE("inside"),
         _unit_of_pairs(0).spread("seconds"),
-        TIME("this_since", lambda stood: stood.since[0]).if_known,
-        TIME("with_since", lambda stood: stood.since[1]).if_known,
-        LOCAL_OF_DAYS("local", lambda stood: next(filter(None, stood.since), None)),
     )
 )
 

@@ -353,7 +353,6 @@ class _Finder:
         best, median = self._scores(rows)
         shown = Thing(
             label=found.label,
-            also_seen_as=(),
             place=found.place,
             spread_m=int(estimate.spots[found.newest[0], Spot.DEV]) / _MM,
             frame_id=frame,
@@ -374,7 +373,7 @@ class _Finder:
 
     def _with_history(self, shown: Thing, instance: Instance, rows: Ints) -> Thing:
         """Returns a described thing with its names, its stays, and whether it is still there."""
-        estimate, stays = self.known.estimate, self._stays_in_window(instance)
+        stays = self._stays_in_window(instance)
         newest = stays[-1]
         moved = []
         for group in _grouped_by_place(stays):
@@ -383,16 +382,12 @@ class _Finder:
             moved.append(self.known.describe_stay(rows_there, place, shown.frame_id, self.places))
         has_moved = len(moved) > 1
         labels = self._count_names(rows)
-        rows_of_all = np.concatenate([stay.spots for stay in instance.stays])
         misread = Counter[str]()
         for stay in instance.stays:
             misread.update(stay.misread_as)
         return replace(
             shown,
             labels=tuple(labels.items()) if len(labels) > 1 else (),
-            also_seen_as=_commonest(
-                count_labels(estimate, estimate.counts, rows_of_all), instance.labels
-            ),
             misread_as=_commonest(misread, instance.labels),
             spread_m=newest.stay.dev_mm / _MM,
             still_there=self._still_there(instance, newest),
