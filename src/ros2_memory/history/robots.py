@@ -54,6 +54,8 @@ _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = 
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 _OWN: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that the recorder of the bag directory made."""
+_MISDATED: Final[Key[frozenset[Path]]] = Key()
+"""Of a call: the recordings with a wrong date."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: by path of a closed recording, the parent of each static frame."""
 _LONG_NS: Final = 30 * NS_PER_S
@@ -279,7 +281,8 @@ def _recording_names(view: View, pairs: Sequence[ParallelRecordings]) -> list[st
 
 def _name(view: View, path: str) -> str:
     """Returns the name of a recording: its path in the bag directory."""
-    return path.removeprefix(f"{view.bag_dir}/")
+    root = f"{view.bag_dir}/"
+    return path.removeprefix(root) if path.startswith(root) else Path(path).name
 
 
 def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
@@ -367,7 +370,6 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     # A thinned day contains the bags of moments and rules of that day.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
-    own, misdated = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir)), _misdated(view)
     loose_files: dict[str, list[str]] = defaultdict(list)
     for file, recording in loose_bags_beside_others(view.snapshot).items():
         loose_files[recording].append(file)
@@ -380,11 +382,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             is_asked = is_there and window.overlaps(span.start, span.stop - 1)
             pair = earlier.path, later.path
             if is_asked and not view.sessions.are_joined(*pair):
-                by_clock = (
-                    _is_short_edge(earlier, later)
-                    or own.issuperset(pair)
-                    or not misdated.isdisjoint(pair)
-                )
+                by_clock = _is_short_edge(earlier, later) or _are_of_wrong_clock(view, *pair)
                 bags = frozenset(loose_files.get(str(later.path), ()))
                 yield ParallelRecordings(*pair, span, by_clock, bags)
         going_on.append(later)
@@ -450,11 +448,20 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
             )
 
 
-def _misdated(view: View) -> set[Path]:
+def _are_of_wrong_clock(view: View, first: Path, other: Path) -> bool:
+    """Whether a wrong clock dated a bag of two recordings, or was set back between or in them.
+
+    It was set back between them if one recorder made both, one after the other.
+    """
+    own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
+    misdated = view.memo.of(_MISDATED, lambda: _misdated(view))
+    return own.issuperset((first, other)) or not misdated.isdisjoint((first, other))
+
+
+def _misdated(view: View) -> frozenset[Path]:
     """Returns the recordings with a bag that a wrong clock dated, or in which it was set back."""
-    faults = view.snapshot.dating.faults
-    loose = loose_bags_beside_others(view.snapshot) if faults else {}
-    return {_recording_of(fault.bag, loose) for fault in faults}
+    loose = loose_bags_beside_others(view.snapshot)
+    return frozenset(_recording_of(fault.bag, loose) for fault in view.snapshot.dating.faults)
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
