@@ -1,22 +1,24 @@
 """Every reader over every kind of file that it reads, for tests that hold for all of them."""
 
 import sqlite3
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import zstandard
 from mcap.writer import CompressionType, IndexType
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
 
+T = TypeVar("T")
 NO_CHUNK_INDEX: Final = IndexType.ATTACHMENT | IndexType.MESSAGE | IndexType.METADATA
 NO_MESSAGE_INDEX: Final = IndexType.ATTACHMENT | IndexType.CHUNK | IndexType.METADATA
 
@@ -64,6 +66,19 @@ class Shelf:
     ) -> tuple[BagReader, Path]:
         """A reader, and one bag that it reads."""
         return self.make_reader(), self.write(folder / f"bag{self.suffix}", messages, declared)
+
+
+def read_through(items: Iterator[T]) -> tuple[list[T], list[BagError]]:
+    """What an iterator yields, and what it raises meanwhile."""
+    found: list[T] = []
+    errors: list[BagError] = []
+    while True:
+        try:
+            found.extend(items)
+        except BagError as error:
+            errors.append(error)
+        else:
+            return found, errors
 
 
 def _mcap(

@@ -88,12 +88,6 @@ def test_bags_have_parts_together_also_beside_one_of_a_clock_that_was_ahead(
     assert count(world, "part") == tables * (2 + len(others))
 
 
-# Bags that a crash cut short
-
-
-# Retention
-
-
 def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     for number in range(40):
@@ -132,40 +126,28 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
     assert check_all(world) == 901
 
 
-# Long bags
-
-
-def decode_in_groups(patch: pytest.MonkeyPatch) -> None:
-    """Has bags decoded in several goes, as those of many gigabytes are."""
-    patch.setattr(decode, "GROUP_BYTES", 1)
-    patch.setattr(bulk, "BATCH_BYTES", 4000)
-
-
 @pytest.fixture
-def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    decode_in_groups(monkeypatch)
-
-
-def write_long_bag(bag_dir: Path, rows: int = 60) -> Path:
+def long_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a bag that is decoded in several goes, as those of many gigabytes are."""
+    monkeypatch.setattr(decode, "GROUP_BYTES", 1)
+    monkeypatch.setattr(bulk, "BATCH_BYTES", 4000)
     messages = [
         message
-        for at in range(T0, T0 + rows * 60 * S, 60 * S)
+        for at in range(T0, T0 + 3600 * S, 60 * S)
         for message in (odom(at, at / S, 0.0), text(at + 5, f"word {at}"))
     ]
-    path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
     os.utime(path, ns=(T0, T0))
-    return path
+    return tmp_path
 
 
-@pytest.mark.usefixtures("small_groups")
 @pytest.mark.parametrize("fault", ["undecodable", "erasing"])
 def test_half_a_bag_is_never_used_and_its_rows_go(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+    long_bag: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    write_long_bag(tmp_path)
-    world = World.of(tmp_path)
+    world = World.of(long_bag)
     halves: list[int] = []
-    erasing = tmp_path / ERASING_FILE
+    erasing = long_bag / ERASING_FILE
 
     def with_fault(reader: BagReader, path: Path, **options: object) -> Iterator[Group]:
         for nth, group in enumerate(undecoded(reader, path)):
@@ -202,29 +184,27 @@ def replace_store(bag_dir: Path) -> None:
     other.store.close()
 
 
-@pytest.mark.usefixtures("small_groups")
 @pytest.mark.parametrize("fault", ["deleted", "replaced", "replaced, and asked meanwhile"])
 def test_a_bag_is_not_stored_on_where_another_program_deleted_or_replaced_what_was(
-    tmp_path: Path, fault: str
+    long_bag: Path, fault: str
 ) -> None:
-    write_long_bag(tmp_path)
-    one = World.of(tmp_path)
+    one = World.of(long_bag)
     [bag] = one.memory.index.snapshot().bags
     groups = map(Group.tables, undecoded(one.memory.reader, bag.path))
 
     def interrupted() -> Iterator[list[Table]]:
         yield next(groups)
         if fault == "deleted":
-            forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
+            forget(store_file(long_bag), long_bag, ["rec/rec_0.mcap"])
         else:
-            replace_store(tmp_path)
+            replace_store(long_bag)
         if fault.endswith("meanwhile"):
             one.store.read(lambda connection: connection.execute("SELECT 1 FROM bag"), None)
         yield from groups
 
     to_store = ReadBag(one.filling._key(bag), bag)
     assert not one.store.put_long(to_store, interrupted(), budget=10**6)
-    again = World.of(tmp_path)
+    again = World.of(long_bag)
     assert again.stored() == (set() if fault == "deleted" else {"other/other_0.mcap"})
     assert count(again, "part") == count(again, "bag") == len(again.stored())
     check_all(again)

@@ -25,13 +25,11 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.view import View
-from ros2_memory.serving import backfill
 from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
 
 S = NS_PER_S
-
 T0 = 1_700_000_400 * S
 
 
@@ -46,18 +44,6 @@ class Words(NamedTuple):
 
 
 WORDS: Final[FragmentKind[Words]] = FragmentKind("words", (Words,))
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> World:
-    """Ten minutes in ten bags, all in parts."""
-    for number in range(10):
-        start = T0 + number * 60 * S
-        poses = [odom(start + n * S, number + n / 60, 0.1 * (n % 7)) for n in range(60)]
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", poses)
-    world = World.of(tmp_path)
-    world.fill()
-    return world
 
 
 def counted(bag_dir: Path, where: str, *given: bytes) -> int:
@@ -130,7 +116,11 @@ def test_arrays_in_rows_are_the_same_once_they_were_stored(sizes: list[int | Non
         np.testing.assert_array_equal(array, back)
 
 
-def test_a_damaged_fragment_is_made_again_and_takes_its_place(world: World, tmp_path: Path) -> None:
+def test_a_damaged_fragment_is_made_again_and_takes_its_place(tmp_path: Path) -> None:
+    for number in range(10):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", driven(number))
+    world = World.of(tmp_path)
+    world.fill()
     world.store.close()
     before = counted(tmp_path, "1")
     for data in (b"\0", compress(b"[]\n"), compress(b"[0]"), b""):
@@ -147,42 +137,21 @@ def test_a_damaged_fragment_is_made_again_and_takes_its_place(world: World, tmp_
         assert counted(tmp_path, "1") == before
 
 
-LENGTH = 1200 * S
-
-"""Of a stretch in these tests: one begins at T0."""
-
-WINDOW = TimeWindow(T0 - LENGTH, T0 + 6 * LENGTH)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def length_of_stretches() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (scan, backfill):
-            patch.setattr(module, "STRETCH_NS", LENGTH)
-        yield
-
-
 def driven(number: int) -> list[Msg]:
     """Odometry of 300 s."""
-    start = T0 + number * 300 * S
-    return [odom(start + n * 5 * S, number + n / 300, 0.1) for n in range(60)]
+    return [odom(T0 + (number * 60 + n) * 5 * S, number + n / 300, 0.1) for n in range(60)]
 
 
-@pytest.fixture(scope="module")
-def driven_world(length_of_stretches: None, tmp_path_factory: pytest.TempPathFactory) -> World:
-    """Four stretches and a half in bags of 300 s, of three recordings."""
-    folder = tmp_path_factory.mktemp("bags")
-    for number in range(18):
-        poses = driven(number)
-        write_mcap(folder / f"rec_{number // 6}" / f"{number}.mcap", poses)
-    driven_world = World.of(folder)
-    driven_world.fill()
-    return driven_world
-
-
-def test_what_was_made_in_time_is_told_before_the_time_is_over(driven_world: World) -> None:
-    view = View(driven_world.memory, Call())
-    opened = open_scan(view, "/odom", WINDOW)
+def test_what_was_made_in_time_is_told_before_the_time_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan, "STRETCH_NS", 1200 * S)
+    for number in range(12):
+        write_mcap(tmp_path / f"rec_{number // 6}" / f"{number}.mcap", driven(number))
+    world = World.of(tmp_path)
+    world.fill()
+    view = View(world.memory, Call())
+    opened = open_scan(view, "/odom", TimeWindow(T0, T0 + 3600 * S))
 
     def made(stretch: Stretch) -> Iterator[tuple[int, Words]]:
         yield stretch.window.start, Words("one")
@@ -203,9 +172,9 @@ def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Pat
         torn = Msg("/tf_static", "tf2_msgs/msg/TFMessage", start + S, b"\0\1\0\0\xff\xff\xff\x7f")
         messages = [fixed, *[torn] * (number == 2), *driven(number)]
         write_mcap(tmp_path / "rec" / f"{number}.mcap", messages)
-    driven_world = World.of(tmp_path)
-    driven_world.fill()
-    for memory in (driven_world.unstored().memory, driven_world.memory, World.of(tmp_path).memory):
+    world = World.of(tmp_path)
+    world.fill()
+    for memory in (world.unstored().memory, world.memory, World.of(tmp_path).memory):
         view = View(memory, Call())
         assert view.sessions.static(view.sessions.session_of(tmp_path / "rec"))
         assert not view.notes.complete

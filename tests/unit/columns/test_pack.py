@@ -1,18 +1,17 @@
 """Columns and tables as bytes, and back; what is known of them unread; how exact they are."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
 from ros2_memory.columns.pack import Packed, compress, decompress, pack, unpack
 from ros2_memory.columns.steps import (
@@ -28,16 +27,8 @@ from ros2_memory.columns.table import Texts, Zone, may_be_in
 from ros2_memory.columns.zones import Zones
 from tests.support.examples import examples
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Values = NDArray[Any]
-
+Values = NDArray[Any]
 INTEGERS = ("bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
-
-FLOATS = ("float32", "float64")
-
-STEPS = (EXACT, RELATIVE, METRES, QUATERNION, DEGREES)
 
 
 def unpacked(packed: Packed) -> Any:
@@ -50,25 +41,20 @@ integers = st.sampled_from(INTEGERS).flatmap(
 
 """Columns of any integer type: near each other, far apart, the least and the greatest."""
 
-_NUMBERS = {
-    "anything": st.floats(width=32),
-    "anything wide": st.floats(),
-    "metres": st.floats(-1e4, 1e4),
-    "decimals": st.integers(-5000, 5000).map(lambda number: number / 100),
-    "zeros": st.sampled_from([0.0, -0.0]),
-}
 
-floats = st.tuples(
-    st.sampled_from(FLOATS),
-    st.sampled_from(sorted(_NUMBERS)).flatmap(lambda name: st.lists(_NUMBERS[name], max_size=40)),
-).map(lambda drawn: of_type(*drawn))
-
-"""Columns of floats: anything, or what robots say."""
-
-
-def of_type(name: str, values: list[float]) -> Values:
+@st.composite
+def floats(draw: st.DrawFn) -> Values:
+    """Columns of floats: anything, or what robots say."""
+    kinds = (
+        st.floats(width=32),
+        st.floats(),
+        st.floats(-1e4, 1e4),
+        st.integers(-5000, 5000).map(lambda number: number / 100),
+        st.sampled_from([0.0, -0.0]),
+    )
     with np.errstate(over="ignore"):
-        return np.array(values).astype(name)
+        numbers = draw(st.one_of([st.lists(kind, max_size=40) for kind in kinds]))
+        return np.array(numbers).astype(draw(st.sampled_from(["float32", "float64"])))
 
 
 @settings(max_examples=examples(300), deadline=None)
@@ -85,9 +71,9 @@ def test_integers_come_back_as_they_were(column: Values) -> None:
     assert packed.error == 0.0
 
 
-@pytest.mark.parametrize("step", STEPS, ids=str)
+@pytest.mark.parametrize("step", [EXACT, RELATIVE, METRES, QUATERNION, DEGREES], ids=str)
 @settings(max_examples=examples(200), deadline=None)
-@given(column=floats)
+@given(column=floats())
 def test_floats_are_off_by_no_more_than_stated_and_half_a_step(step: Step, column: Values) -> None:
     packed = pack(column, step)
     back = unpacked(packed)
@@ -143,27 +129,24 @@ def test_damaged_bytes_are_refused() -> None:
 
 def test_packed_bytes_of_this_format_do_not_change() -> None:
     """Stores that robots have are read by the bytes' format."""
-    assert hashlib.sha256(golden()).hexdigest()[:16] == "1e7c6ee5255c0501", (
-        "packed columns are other bytes than before: raise FORMAT in columns/pack.py, so that "
-        "stores are filled anew, and pin the new hash here"
-    )
-
-
-def golden() -> bytes:
-    times = 1_768_176_000_000_000_000 + np.arange(40) * 20_000_000
+    times, roots = 1_768_176_000_000_000_000 + np.arange(40) * 20_000_000, np.sqrt(np.arange(40))
     columns = [
         pack(times),
         pack(times + (np.arange(40) * 7919) % 4001),
         pack(np.arange(40) ** 3 % 251 / 8.0, RELATIVE),
-        pack(np.sqrt(np.arange(40)), METRES),
-        pack(np.sqrt(np.arange(40)), RELATIVE),
-        pack(np.sqrt(np.arange(40)).astype(np.float32), EXACT),
+        pack(roots, METRES),
+        pack(roots, RELATIVE),
+        pack(roots.astype(np.float32), EXACT),
         pack(np.array([1.5, np.nan, np.inf]), RELATIVE),
         pack(np.array([0, 2**64 - 1], np.uint64)),
         pack(np.array([True, False, True])),
         pack(Texts.of(["cup", "Tasse", "cup"])),
     ]
-    return b"".join(f"{packed.codec}|{packed.zone}|".encode() + packed.data for packed in columns)
+    golden = b"".join(f"{packed.codec}|{packed.zone}|".encode() + packed.data for packed in columns)
+    assert hashlib.sha256(golden).hexdigest()[:16] == "1e7c6ee5255c0501", (
+        "packed columns are other bytes than before: raise FORMAT in columns/pack.py, so that "
+        "stores are filled anew, and pin the new hash here"
+    )
 
 
 @pytest.mark.parametrize("size", [4, 8])
@@ -180,23 +163,14 @@ BOUNDS = st.one_of(
     st.floats(allow_nan=False),
     st.booleans(),
 )
-
-
-WORDS = st.one_of(st.none(), st.text("ab[{\n", max_size=6))
-
-
-@st.composite
-def zones(draw: st.DrawFn) -> Zone:
-    if draw(st.booleans()):
-        return Zone(words=draw(WORDS))
-    if draw(st.integers(0, 5)) == 0:
-        return Zone()
-    low, high = sorted((draw(BOUNDS), draw(BOUNDS)))
-    return Zone(low, high)
+ZONES = st.one_of(
+    st.builds(Zone, words=st.none() | st.text("ab[{\n", max_size=6)),
+    st.tuples(BOUNDS, BOUNDS).map(lambda ends: Zone(*sorted(ends))),
+)
 
 
 @settings(max_examples=examples(300), deadline=None)
-@given(st.one_of(integers, floats))
+@given(integers | floats())
 def test_zones_are_exact(column: Values) -> None:
     zone = pack(column, METRES).zone
     there = [value for value in column.tolist() if not math.isnan(value)]
@@ -217,14 +191,14 @@ def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], tex
             assert Zones.of([1], [zone]).may_have(asked).all()
 
 
-LIMITS = st.one_of(BOUNDS, st.just(10**400), st.just(-(10**400)))
+LIMITS = BOUNDS | st.sampled_from([10**400, -(10**400)])
 
 
 def is_exact(*numbers: float) -> bool:
     return all(not math.isfinite(number) or abs(number) < 2**53 for number in numbers)
 
 
-@given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
+@given(st.lists(ZONES, min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
 @example([Zone(0, sys.float_info.max)], 1, "")
 @example([Zone(0, math.inf)], 10**400, "")
 @example([Zone(-math.inf, 0)], -(10**400), "")

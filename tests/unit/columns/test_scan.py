@@ -30,7 +30,6 @@ from tests.support.examples import examples
 from tests.support.memories import asked, assert_same_counts, memory_of
 
 S = 10**9
-
 T0 = 1_700_000_400 * S
 
 
@@ -56,27 +55,23 @@ def test_a_store_that_fails_while_it_is_asked_hides_no_row(
     write_splits(tmp_path, [odom(T0 + n * 50 * S, n / 3, -n / 7) for n in range(40)], 500)
     World.of(tmp_path).fill()
     world = World.of(tmp_path)
-    whole = getattr(world.store, name)
-    read = world.store.read
-    failing = [True]
+    whole, read = getattr(world.store, name), world.store.read
 
-    def busy(*given: object) -> object:
-        def fail(_: sqlite3.Connection) -> object:
-            error = sqlite3.OperationalError("database is locked")
-            error.sqlite_errorcode = sqlite3.SQLITE_BUSY
-            raise error
+    def fail(_: sqlite3.Connection) -> object:
+        error = sqlite3.OperationalError("database is locked")
+        error.sqlite_errorcode = sqlite3.SQLITE_BUSY
+        raise error
 
-        if failing:
-            failing.clear()
-            with monkeypatch.context() as patch:
-                patch.setattr(world.store, "read", lambda _, unknown: read(fail, unknown))
-                return whole(*given)
-        return whole(*given)
+    def busy_once(*given: object) -> object:
+        monkeypatch.undo()
+        with monkeypatch.context() as patch:
+            patch.setattr(world.store, "read", lambda _, unknown: read(fail, unknown))
+            return whole(*given)
 
-    monkeypatch.setattr(world.store, name, busy)
+    monkeypatch.setattr(world.store, name, busy_once)
     with suppress(GoneError):  # then it says so
         assert check_rows(world, "/odom") == 40
-    assert not failing
+    assert getattr(world.store, name) == whole
     assert check_rows(world, "/odom") == 40
 
 
@@ -139,10 +134,10 @@ def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
         world.fill()
         plain = world.unstored().memory
         started = World.of(folder).memory  # what it knows it has from the store
-        for tool, given_ in questions(Random(seed)):
-            expected = asked(plain, tool, **given_)
+        for tool, asks in questions(Random(seed)):
+            expected = asked(plain, tool, **asks)
             assert expected.get("error") != "invalid_arguments", expected
-            assert_same_counts(asked(started, tool, **given_), expected, of_means=0.02)
+            assert_same_counts(asked(started, tool, **asks), expected, of_means=0.02)
 
 
 def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Path) -> None:

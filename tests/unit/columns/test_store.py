@@ -2,11 +2,9 @@
 
 import hashlib
 import os
-import random
 import re
 import sqlite3
 import struct
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -44,23 +42,18 @@ from tests.support.fakes import files_limited_to
 from tests.support.memories import ROOT
 
 S = 10**9
-
 T0 = 1_700_000_400 * S
-
 ZSTD = b"\x28\xb5\x2f\xfd"
 
 
-def write_bags(bag_dir: Path, count: int = 4) -> list[Path]:
-    paths = []
-    for number in range(count):
+def write_bags(bag_dir: Path) -> None:
+    for number in range(4):
         start = T0 + number * 10 * S
         messages = [odom(start + n * S // 2, n / 7, number / 3) for n in range(20)]
         messages += [detections(start + S, ["cup", f"thing {number}"]), battery(start + 2 * S, 0.7)]
         messages += [text(start + 3 * S, ""), text(start + 4 * S, "Straße")]
         path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
         os.utime(path, ns=(T0, T0))
-        paths.append(path)
-    return paths
 
 
 @pytest.fixture
@@ -100,18 +93,13 @@ def stored_rows(file: Path) -> str:
     """A hash of all that is in a store, but for how it is compressed and what files looked like."""
     digest = hashlib.sha256()
     with closing(sqlite3.connect(file)) as base:
-        tables = {
-            "bag": "id, path, first_ns, last_ns, messages, hashed, definitions, summary, counts",
-            "summary": "*",
-            "topic": "*",
-            "definition": "*",
-            "part": "*",
-            "part_column": "*",
-            "zone": "*",
-            "fragment": "id, start_ns, parts, data",
-            "fragment_part": "*",
-        }
-        for table, columns in tables.items():
+        of_bags = "id, path, first_ns, last_ns, messages, hashed, definitions, summary, counts"
+        some = {"bag": of_bags, "fragment": "id, start_ns, parts, data"}
+        for table in (
+            *("bag", "summary", "topic", "definition", "part", "part_column", "zone"),
+            *("fragment", "fragment_part"),
+        ):
+            columns = some.get(table, "*")
             for row in base.execute(f"SELECT {columns} FROM {table} ORDER BY 1, 2"):  # noqa: S608
                 values = [
                     decompress(value)
@@ -136,10 +124,7 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
     )
 
 
-@pytest.mark.parametrize(
-    "statement",
-    ["PRAGMA user_version = 99", "DROP TABLE part_column"],
-)
+@pytest.mark.parametrize("statement", ["PRAGMA user_version = 99", "DROP TABLE part_column"])
 def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew(
     world: World, tmp_path: Path, statement: str
 ) -> None:
@@ -153,25 +138,17 @@ def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew
     assert store_file(tmp_path).with_name("columns.sqlite.aside").exists()
 
 
-def replace_log(path: Path) -> None:
-    """What another program does that takes the file for a new one."""
-    log = path.with_name(f"{path.name}-wal")
-    log.unlink()
-    log.touch()
-
-
-def delete_file(path: Path) -> None:
-    path.unlink()
-
-
-@pytest.mark.parametrize("fault", [replace_log, delete_file])
+@pytest.mark.parametrize("replaced", ["columns.sqlite-wal", "columns.sqlite"])
 def test_what_is_read_while_the_files_are_replaced_does_not_count(
-    world: World, tmp_path: Path, fault: Callable[[Path], None]
+    world: World, tmp_path: Path, replaced: str
 ) -> None:
     failures = world.store.failures
 
     def read(connection: sqlite3.Connection) -> int:
-        fault(store_file(tmp_path))
+        path = store_file(tmp_path).with_name(replaced)
+        path.unlink()
+        if path.suffix != ".sqlite":  # as a program does that takes the file for a new one
+            path.touch()
         return int(connection.execute("SELECT count(*) FROM part").fetchone()[0])
 
     assert world.store.read(read, -1) == -1
@@ -244,13 +221,6 @@ def secrets(number: int) -> list[bytes]:
     return [*(each.encode() for each in texts), (T0 + number * 60 * S).to_bytes(8, "big")]
 
 
-def all_packed(file: Path) -> list[bytes]:
-    """All that is all_packed."""
-    with closing(sqlite3.connect(file)) as base:
-        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    return [bytes(blob) for (blob,) in columns]
-
-
 def values(file: Path) -> dict[str, list[bytes]]:
     """All that the rows of each table hold, as SQLite writes it."""
     found: dict[str, list[bytes]] = {}
@@ -284,17 +254,13 @@ def bytes_of(folder: Path) -> bytes:
 
 
 def all_unpacked(file: Path) -> bytes:
-    """All that is all_packed, all_unpacked."""
-    return b"".join(map(decompress, all_packed(file)))
+    """What all columns hold."""
+    with closing(sqlite3.connect(file)) as base:
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    return b"".join(decompress(blob) for (blob,) in columns)
 
 
-DERIVED = {
-    True: {"part", "part_column", "fragment", "zone"},
-    False: {"part", "part_column", "zone"},
-}
-
-
-@pytest.mark.parametrize("merged", DERIVED)
+@pytest.mark.parametrize("merged", [True, False])
 def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> None:
     for number in range(14):
         write_secret(tmp_path, number)
@@ -314,7 +280,8 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
         for table, some in before.items()
         if (slices := {part for part in some if part not in kept})
     }
-    assert gone.keys() == {"bag", "summary", "topic", "definition", *DERIVED[merged]}
+    of_bags = {"bag", "summary", "topic", "definition", "part", "part_column", "zone"}
+    assert gone.keys() == of_bags | ({"fragment"} if merged else set())
     assert [part for some in gone.values() for part in some if part in left] == []
     assert [secret for secret in secrets(3) if secret in left + all_unpacked(file)] == []
     assert "rec/rec_3.mcap" not in world.stored()
@@ -393,37 +360,27 @@ def section() -> str:
     return text.partition("## The store of columns")[2]
 
 
-def query(question: str) -> str:
-    match = re.search(re.escape(question) + r"\n\n```sql\n(.+?);\n```", section(), re.DOTALL)
-    assert match is not None
-    return match[1]
-
-
-@pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    bag_dir = tmp_path_factory.mktemp("bags")
-    draw = random.Random(3)
+def test_columns_that_are_dropped_and_bytes_of_each_topic(tmp_path: Path) -> None:
+    draw = Random(3)
     for number in range(3):
         start = T0 + number * 3000 * S
         messages = [battery(start + n * S, 0.9 - number / 10 - n / 1000) for n in range(5)]
         messages += [
             odom(start + n * S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9)) for n in range(300)
         ]
-        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+        path = write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
         os.utime(path, ns=(T0, T0))
-    World.of(bag_dir, limits=StoreLimits(max_share=0.0)).fill()
-    return store_file(bag_dir)
+    World.of(tmp_path, limits=StoreLimits(max_share=0.0)).fill()
 
+    def answer(question: str) -> list[Any]:
+        match = re.search(re.escape(question) + r"\n\n```sql\n(.+?);\n```", section(), re.DOTALL)
+        assert match is not None
+        with closing(sqlite3.connect(store_file(tmp_path))) as base:
+            return base.execute(match[1]).fetchall()
 
-def answer(file: Path, question: str) -> list[Any]:
-    with closing(sqlite3.connect(file)) as base:
-        return base.execute(query(question)).fetchall()
-
-
-def test_columns_that_are_dropped_and_bytes_of_each_topic(file: Path) -> None:
-    dropped = answer(file, "Of which topics are columns dropped, and since when?")
+    dropped = answer("Of which topics are columns dropped, and since when?")
     assert dropped == [("/odom", "2023-11-14 22:20:00", 3)]
-    sizes = dict(answer(file, "How many bytes does each topic take?"))
+    sizes = dict(answer("How many bytes does each topic take?"))
     assert sizes.keys() == {"/battery_state", "/odom"}
 
 

@@ -1,7 +1,6 @@
 """What columns say of conditions, values, poses, detections and states: as decoded messages do."""
 
 import math
-import random
 from collections.abc import Sequence
 from random import Random
 
@@ -19,10 +18,7 @@ from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
-from ros2_memory.columns.values import (
-    TruthValues,
-    seconds,
-)
+from ros2_memory.columns.values import seconds
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
@@ -44,19 +40,7 @@ from tests.unit.columns.drawn_tables import (
 )
 
 EXTRACTOR = shipped_extractor()
-
-
 RANDOM = st.randoms(use_true_random=False)
-
-
-def compared(found: TruthValues, condition: Condition, values: list[JsonValue]) -> int:
-    """Checks what is settled; returns how many rows are not."""
-    expected = np.array([condition.matches(value) for value in values])
-    assert not (found.surely & found.unsure).any()
-    assert found.is_none == (not (found.surely | found.unsure).any())
-    wrong = np.flatnonzero((found.surely != expected) & ~found.unsure)
-    assert not wrong.size, (condition, values[wrong[0]])
-    return int(found.unsure.sum())
 
 
 def as_part(table: Table) -> PartZones:
@@ -78,11 +62,18 @@ def judged(
     values: list[JsonValue],
     extractor: SchemaExtractor = EXTRACTOR,
 ) -> int:
-    """Checks what a table says of each of its rows, and what is ruled out without reading any."""
-    column = ColumnCondition(condition, extractor)
-    if not np.all(column.may_match(as_part(table))):
-        assert not any(map(condition.matches, values)), condition
-    return compared(column.truth(table), condition, values)
+    """Checks what a table says of each of its rows, and what is ruled out without reading any.
+
+    Returns of how many rows it does not say.
+    """
+    column, expected = ColumnCondition(condition, extractor), [*map(condition.matches, values)]
+    assert np.all(column.may_match(as_part(table))) or not any(expected), condition
+    found = column.truth(table)
+    assert not (found.surely & found.unsure).any()
+    assert found.is_none == (not (found.surely | found.unsure).any())
+    wrong = np.flatnonzero((found.surely != np.array(expected)) & ~found.unsure)
+    assert not wrong.size, (condition, values[wrong[0]])
+    return int(found.unsure.sum())
 
 
 def values_of(drawn: Drawn, extractor: SchemaExtractor = EXTRACTOR) -> list[JsonValue]:
@@ -125,12 +116,10 @@ FULL_PATHS = (
     *(f"orientation.{angle}" for angle in ANGLES),
 )
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-
 
 @settings(max_examples=examples(150), deadline=None)
 @given(
-    drawn_tables() | drawn_tables((ODOMETRY,)),
+    drawn_tables() | drawn_tables(("nav_msgs/msg/Odometry",)),
     st.sampled_from([None, None, 1e-6, 1e-4, 1e-3]),
     RANDOM,
 )
@@ -186,60 +175,46 @@ POSED = (
     "px4_msgs/msg/VehicleLocalPosition",
 )
 SETTLED = (*POSED, "own_msgs/msg/Everything", "own_msgs/msg/Label")
-HALF_STEP = 0.51e-4
-
-
-def alike(found: float, expected: float, off: float) -> bool:
-    if math.isnan(expected) or math.isinf(expected):
-        return found == expected or (math.isnan(found) and math.isnan(expected))
-    return abs(found - expected) <= max(off, 1e-12 * abs(expected))
-
-
-def poses_compared(table: Table, drawn: Drawn, off: float) -> bool:
-    """Checks what the columns settle; returns whether they do."""
-    expected = [EXTRACTOR.pose(each, drawn.type) for each in drawn.messages]
-    twists = [EXTRACTOR.twist(each, drawn.type) for each in drawn.messages]
-    try:
-        found = PoseColumns(EXTRACTOR).of(table, table.log_times, None)
-    except NoPoseError:
-        assert expected == [None] * len(expected)
-        return True
-    if found is None:
-        return False
-    assert found.times.tolist() == table.log_times.tolist()
-    for row, (pose, twist) in enumerate(zip(expected, twists, strict=True)):
-        assert pose is not None
-        for one, other in zip(found.positions[row].tolist(), pose.position, strict=True):
-            assert alike(one, other, off)
-        turn = (math.nan,) * 4 if pose.orientation is None else pose.orientation
-        for one, other in zip(found.turns[row].tolist(), turn, strict=True):
-            assert alike(one, other, 2 * off)
-        assert found.frames.words[found.frames.codes[row]] == pose.frame_id
-        speed = math.nan if twist is None else math.hypot(*twist.linear)
-        assert alike(found.speeds[row], speed, 2 * off)
-    return True
 
 
 @settings(max_examples=examples(180), deadline=None)
 @given(drawn_tables(SETTLED) | drawn_tables())
 def test_poses_of_columns_are_those_of_drawn_messages(drawn: Drawn) -> None:
     """Of other types columns settle none that messages do not have."""
-    assert poses_compared(drawn.table, drawn, HALF_STEP) or drawn.type not in SETTLED
+    expected = [EXTRACTOR.pose(each, drawn.type) for each in drawn.messages]
+    times = drawn.table.log_times
+    try:
+        found = PoseColumns(EXTRACTOR).of(drawn.table, times, None)
+    except NoPoseError:
+        assert expected == [None] * len(expected)
+        return
+    if found is None:
+        assert drawn.type not in SETTLED
+        return
+    assert found.times.tolist() == times.tolist()
+    for row, (pose, message_) in enumerate(zip(expected, drawn.messages, strict=True)):
+        assert pose is not None
+        twist = EXTRACTOR.twist(message_, drawn.type)
+        turn = (math.nan,) * 4 if pose.orientation is None else pose.orientation
+        speed = math.nan if twist is None else math.hypot(*twist.linear)
+        numbers_found = [*found.positions[row], *found.turns[row], found.speeds[row]]
+        near = pytest.approx([*pose.position, *turn, speed], rel=1e-9, abs=1e-12, nan_ok=True)
+        assert numbers_found == near
+        assert found.frames.words[found.frames.codes[row]] == pose.frame_id
 
 
 @pytest.mark.parametrize("type_name", POSED)
 def test_poses_of_rounded_columns_are_the_same_bit_by_bit(type_name: str) -> None:
-    draw = random.Random(type_name)
+    draw = Random(type_name)
     drawn = drawn_of(type_name, [message(type_name, draw, is_odd=False) for _ in range(40)])
     whole = PoseColumns(EXTRACTOR).of(drawn.table, drawn.table.log_times, None)
     some = np.array([3, 4, 30])
-    rounded = PoseColumns(EXTRACTOR).of(
-        stored(drawn.table, 1e-4), drawn.table.log_times[some], some
-    )
+    table = stored(drawn.table, 1e-4)
+    found = PoseColumns(EXTRACTOR).of(table, drawn.table.log_times[some], some)
     assert whole is not None
-    assert rounded is not None
-    assert np.array_equal(rounded.positions, whole.positions[some])
-    assert rounded.frames.values() == whole.rows(some).frames.values()
+    assert found is not None
+    assert np.array_equal(found.positions, whole.positions[some])
+    assert found.frames.values() == whole.rows(some).frames.values()
 
 
 def detections_in(message: object, type_name: str) -> list[Detection]:
@@ -287,10 +262,9 @@ def detections_compared(table: Table, messages: Sequence[object], step: float = 
     if found is None:
         return False
     assert listed(found.detections, step) == listed(expected, step)
-    stamps = [getattr(getattr(each, "header", None), "stamp", None) for each in messages]
     if found.stamps is not None:
-        read = [each.sec * 10**9 + each.nanosec for each in stamps if each is not None]
-        assert found.stamps.tolist() == read
+        stamps = [each.header.stamp for each in messages]  # type: ignore[attr-defined]
+        assert found.stamps.tolist() == [each.sec * 10**9 + each.nanosec for each in stamps]
     return True
 
 
@@ -351,9 +325,6 @@ def test_columns_state_what_drawn_messages_state(drawn: Drawn) -> None:
             states_compared(stored(drawn.table, step), drawn)
 
 
-STRING = "std_msgs/msg/String"
-
-
 PLAIN = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
@@ -361,7 +332,7 @@ PLAIN = (
     "sensor_msgs/msg/BatteryState",
     "rcl_interfaces/msg/Log",
     "px4_msgs/msg/VehicleOdometry",
-    STRING,
+    "std_msgs/msg/String",
     "std_msgs/msg/Int64",
     "std_msgs/msg/Float32",
 )

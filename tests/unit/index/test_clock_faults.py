@@ -28,11 +28,8 @@ from tests.support.mcap_surgery import chunks_of
 from tests.support.memories import asked, memory_of
 
 S = 10**9
-
 HOUR = 3600 * S
-
 DAY = 24 * HOUR
-
 NOW = 1_790_000_000 * S
 
 
@@ -164,16 +161,16 @@ def test_messages_of_a_file_that_cannot_be_read_lie_between_its_neighbours_and_f
 
 
 def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None:
-    assert unreadable_bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
-        MIN_NS, NOW - HOUR + 60 * S
-    )
-    assert unreadable_bounds("someones", Neighbours(), None, NOW) is None
-    assert unreadable_bounds("someones", Neighbours(), 5 * S, NOW) is None
+    before = TimeWindow(MIN_NS, NOW - HOUR + 60 * S)
+    assert unreadable_bounds("someones", Neighbours(), NOW - HOUR, NOW) == before
 
-
-def test_times_that_contradict_each_other_bound_nothing() -> None:
-    assert unreadable_bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
-    assert unreadable_bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
+    for near, written in (
+        *((Neighbours(), no_date) for no_date in (None, 5 * S)),
+        # Times that contradict each other bound nothing.
+        (Neighbours(200 * S, 100 * S), NOW),
+        (Neighbours(NOW), NOW - HOUR),
+    ):
+        assert unreadable_bounds("rec", near, written, NOW) is None
 
 
 BEGIN: Final = 1_784_000_000 * S

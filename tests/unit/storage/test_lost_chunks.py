@@ -2,8 +2,7 @@
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from ros2_memory.core.errors import BagContradictionError, BagError, Undecodable
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
+from ros2_memory.storage.base import BagReader, Channel, Record, Schema
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
 from ros2_memory.storage.mcap import bulk
@@ -30,6 +29,7 @@ from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text,
 from tests.support.examples import examples
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, damaged, spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
+from tests.support.reader_cases import read_through
 
 S = 10**9
 
@@ -37,14 +37,6 @@ S = 10**9
 LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
 
 EVERYTHING = TimeWindow.everything()
-
-
-def damaged_bag(path: Path) -> tuple[Path, range]:
-    """A bag of 40 messages at 0, 1, 2 ... ns, and which of them are in a damaged chunk."""
-    write_mcap(path, chatter(40), SMALL)
-    lost = chunks_of(path)[3]
-    spoil_chunk(path, 3)
-    return path, range(lost.message_start_time, lost.message_end_time + 1)
 
 
 @pytest.mark.parametrize("newest_first", [False, True])
@@ -60,18 +52,14 @@ def damaged_bag(path: Path) -> tuple[Path, range]:
 def test_reading_goes_on_behind_a_damaged_chunk(
     tmp_path: Path, made: Callable[[Path], BagReader], newest_first: bool
 ) -> None:
-    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", chatter(40), SMALL)
+    lost = chunks_of(path)[3]
+    spoil_chunk(path, 3)
     records = made(tmp_path).records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
-    before: list[int] = []
-    with pytest.raises(BagError) as caught:
-        before.extend(each.log_time for each in iter(partial(next, records), None))
-    assert caught.value.lost == (lost[0], lost[-1])
-    whole = [time for time in range(40) if time not in lost]
-    if newest_first:
-        whole.reverse()
-    assert [*before, *(each.log_time for each in records)] == whole
-    assert before == whole[: len(before)]
-    assert all((time > lost[-1]) == newest_first for time in before)
+    found, [error] = read_through(records)
+    assert error.lost == (lost.message_start_time, lost.message_end_time)
+    whole = [*range(lost.message_start_time), *range(lost.message_end_time + 1, 40)]
+    assert [each.log_time for each in found] == sorted(whole, reverse=newest_first)
 
 
 def overlapping(folder: Path) -> Memory:
@@ -155,27 +143,6 @@ def test_errors_of_the_tree_and_interruptions_pass_as_they_are(error: BaseExcept
 TOPICS = ("/chatter", "/bumper")
 
 
-def all_of(items: Iterator[Record] | Iterator[Batch]) -> tuple[list[object], list[BagError]]:
-    """What an iterator yields, and what it raises meanwhile."""
-    found: list[object] = []
-    errors: list[BagError] = []
-    while True:
-        try:
-            found.append(next(items))
-        except StopIteration:
-            return found, errors
-        except BagError as error:
-            errors.append(error)
-
-
-def records_in(batches: Iterable[object]) -> Counter[object]:
-    return Counter[object](
-        batch.record(nth)  # type: ignore[attr-defined]
-        for batch in batches
-        for nth in range(batch.sizes.size)  # type: ignore[attr-defined]
-    )
-
-
 @settings(max_examples=examples(150))
 @given(
     st.integers(0, 2**32),
@@ -186,14 +153,13 @@ def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, how: McapLayo
     with tempfile.TemporaryDirectory() as folder:
         path = write_mcap(Path(folder) / "a.mcap", messages, how)
         path.write_bytes(damaged(path.read_bytes(), seed))
-        records, errors = all_of(McapReader().records(path, TOPICS, EVERYTHING))
-        batches, others = all_of(McapReader().batches(path, TOPICS, EVERYTHING))
-    found, expected = records_in(batches), Counter[object](records)
-    contradicted = any(isinstance(error, BagContradictionError) for error in errors)
+        records, errors = read_through(McapReader().records(path, TOPICS, EVERYTHING))
+        batches, others = read_through(McapReader().batches(path, TOPICS, EVERYTHING))
     # Where indexes lie, the rest is read in the order of the file, up to where that is damaged:
     # messages beyond may have come before by their times.
-    if not contradicted:
-        assert found == expected
+    if not any(isinstance(error, BagContradictionError) for error in errors):
+        found = Counter(each.record(nth) for each in batches for nth in range(each.sizes.size))
+        assert found == Counter(records)
     assert bool(errors) == bool(others)
 
 

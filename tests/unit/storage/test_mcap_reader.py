@@ -32,9 +32,9 @@ from tests.support.mcap_surgery import (
     spoil_chunk,
 )
 from tests.support.memories import asked, memory_of
+from tests.support.reader_cases import read_through
 
 EVERYTHING = TimeWindow.everything()
-
 STRING = "std_msgs/msg/String"
 
 
@@ -76,17 +76,9 @@ def read_on(
     reader: McapReader, path: Path, *, newest_first: bool = False
 ) -> tuple[list[int], list[str]]:
     """The log times of all messages, and the notes on contradictions on the way."""
-    notes: list[str] = []
-    found: list[int] = []
     records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
-    while True:
-        try:
-            for each in records:
-                found.append(each.log_time)  # noqa: PERF401 - what came before an error counts
-        except BagContradictionError as error:
-            notes.append(error.reason)
-        else:
-            return found, notes
+    found, errors = read_through(records)
+    return times(found), [error.reason for error in errors]
 
 
 def test_statistics_that_are_wrong_are_noted_and_not_believed(path: Path) -> None:
