@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -147,7 +148,7 @@ def tools_of(fleet: Fleet, at_once: int = 4, max_chars: int = MOST_CHARS) -> dic
     return {tool.name: tool for tool in fleet_tools(tools, fleet, max_chars, at_once)}
 
 
-def reply(fleet: Fleet, tool: str, given: dict[str, object], call: Call | None = None) -> Any:
+def reply(fleet: Fleet, tool: str, given: Mapping[str, object], call: Call | None = None) -> Any:
     """The JSON of a fleet's reply, be it an error; robots are asked one after another.
 
     So what the first answer decides what the others need not.
@@ -155,13 +156,13 @@ def reply(fleet: Fleet, tool: str, given: dict[str, object], call: Call | None =
     return reply_of(tools_of(fleet, at_once=1)[tool], given, call)
 
 
-def reply_of(tool: Tool, given: dict[str, object], call: Call | None = None) -> Any:
+def reply_of(tool: Tool, given: Mapping[str, object], call: Call | None = None) -> Any:
     """The JSON of a tool of a fleet, be it an error."""
     replies = Replies(Path("nowhere"), MOST_CHARS)
     # The memory is that of no robot.
     none: Any = None
     try:
-        answer = replies.answer(tool.question(given)(none, call or Call()))
+        answer = replies.answer(tool.question({**given})(none, call or Call()))
     except EpisodicError as error:
         answer = replies.error(error)
     return json.loads(answer.text)

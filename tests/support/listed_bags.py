@@ -12,9 +12,9 @@ def odom_bag(
     *,
     count: int = 2,
     written: Ns = 1,
-    state: BagState = BagState.CLOSED,
     notes: tuple[str, ...] = (),
 ) -> BagFile:
     """A bag of odometry from its first to its last message."""
     topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", count, start, end),)
-    return BagFile(file, 1, written, state, BagSummary(topics, notes=notes), start, end)
+    summary = BagSummary(topics, notes=notes)
+    return BagFile(file, 1, written, BagState.CLOSED, summary, start, end)

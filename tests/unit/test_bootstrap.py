@@ -6,12 +6,7 @@ import pytest
 from mcp import Client
 
 from ros2_memory import package_version
-from ros2_memory.bootstrap import (
-    build_backfill,
-    build_memory,
-    build_reader,
-    build_server,
-)
+from ros2_memory.bootstrap import build_backfill, build_memory, build_reader, build_server
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import ConfigError
 from tests.support.robot_run import ANSWERED, T0_S, ask, write_run
@@ -79,9 +74,8 @@ async def test_where_the_disk_does_not_tell_no_question_is_an_internal_error(
     memory = build_memory(chosen)
     if lost == "after a look":
         memory.index.snapshot()
-    out_of_reach = bag_dir
-    if lost == "the recorder's files":
-        out_of_reach = tmp_path / "run" / ".episodic"
+    own = tmp_path / "run" / ".episodic"
+    out_of_reach = own if lost == "the recorder's files" else bag_dir
     out_of_reach.unlink(missing_ok=True)
     out_of_reach.symlink_to("x" * 300)
     async with Client(build_server(chosen, memory)) as client:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
@@ -38,9 +38,6 @@ def shown(message: object, type_name: str, *fields: str) -> Any:
     return EXTRACTOR.shown(message, type_name, fields).value
 
 
-# What the specification asks of its types
-
-
 def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_conditions() -> None:
     many = detections(*(f"thing {n}" for n in range(80)))
     extracted = EXTRACTOR.shown(many, DETECTIONS)
@@ -49,9 +46,6 @@ def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_co
     assert isinstance(exact, dict)
     assert isinstance(exact["detections"], list)
     assert len(exact["detections"]) == 80
-
-
-# Types without an entry, and JSON
 
 
 def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
@@ -76,9 +70,6 @@ def test_fields_that_a_message_lacks_are_null_with_a_note() -> None:
     extracted = EXTRACTOR.shown({"status": "on", "skill": "scene"}, DETECTIONS)
     assert extracted.value == {"skill": "scene", "detections": None}
     assert extracted.notes == ("detections: this message has no such field",)
-
-
-# `fields`
 
 
 def test_fields_over_a_list_take_an_element_or_map_over_all() -> None:
@@ -120,16 +111,10 @@ def test_an_unknown_field_of_an_unmapped_type_is_refused_with_what_the_message_h
         EXTRACTOR.shown({f"k{n}": n for n in range(50)}, "json", ["c"])
 
 
-# What would fill a reply alone
-
-
 @given(st.recursive(st.text(max_size=300), lambda inner: st.lists(inner, max_size=30)))
 def test_no_list_of_texts_is_too_long_to_be_shown(message: object) -> None:
     extracted = SchemaExtractor({}, 50, max_chars=800).shown(message, "json")
     assert len(repr(extracted.value)) <= 1600
-
-
-# The map itself
 
 
 @pytest.mark.parametrize("path", ["", "pose..x", "pose/x", ".pose", "pose.", "__dict__"])
@@ -185,19 +170,15 @@ def definitions() -> Typesdict:
 
 def leads_somewhere(type_name: str, path: str) -> bool:
     """Whether each segment names a field of the definition before it."""
+    found: Any = type_name
     for segment in path.split("."):
-        fields = dict(definitions()[type_name][1]) if type_name in definitions() else {}
+        fields = dict(definitions()[found][1]) if isinstance(found, str) else {}
         if segment not in fields:
             return False
-        type_name = element_type(fields[segment])
+        node, found = fields[segment]
+        if node in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+            _, found = found[0]
     return True
-
-
-def element_type(description: FieldDesc) -> str:
-    """The message type of a field or of its elements; empty for numbers and strings."""
-    if description[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
-        description = description[1][0]
-    return description[1] if isinstance(description[1], str) else ""
 
 
 @pytest.mark.parametrize("type_name", shipped_schemas())

@@ -1,8 +1,6 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
-import math
-from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -31,30 +29,31 @@ from tests.support.memories import asked, each_way, memory_of
 S = 10**9
 T0_S = 1_784_000_000
 T0 = T0_S * S
-YAW = math.radians(30)
 
 
-def vehicle(ns: int, x: float, y: float) -> Msg:
-    def triple(*parts: float) -> Any:
+VEHICLE = "/fmu/out/vehicle_odometry"
+
+
+def vehicle(ns: int, x: float, topic: str = VEHICLE) -> Msg:
+    def floats(*parts: float) -> Any:
         return np.array(parts, dtype=np.float32)
 
+    variances = ("position_variance", "orientation_variance", "velocity_variance")
     body = make(
         "px4_msgs/msg/VehicleOdometry",
         timestamp=ns // 1000,
         timestamp_sample=ns // 1000,
         pose_frame=1,
-        position=triple(x, y, -2.0),
-        q=triple(math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)),
+        position=floats(x, 0.0, -2.0),
+        q=floats(1.0, 0.0, 0.0, 0.0),
         velocity_frame=3,
-        velocity=triple(0.5, 0.0, 0.0),
-        angular_velocity=triple(0.0, 0.0, -0.25),
-        position_variance=triple(0.0, 0.0, 0.0),
-        orientation_variance=triple(0.0, 0.0, 0.0),
-        velocity_variance=triple(0.0, 0.0, 0.0),
+        velocity=floats(0.5, 0.0, 0.0),
+        angular_velocity=floats(0.0, 0.0, -0.25),
         reset_counter=0,
         quality=100,
+        **dict.fromkeys(variances, np.zeros(3, np.float32)),
     )
-    return Msg("/fmu/out/vehicle_odometry", "px4_msgs/msg/VehicleOdometry", ns, body)
+    return Msg(topic, "px4_msgs/msg/VehicleOdometry", ns, body)
 
 
 def fix(ns: int, north: float, east: float, status: int = 0) -> Msg:
@@ -107,37 +106,34 @@ def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
     tmp_path: Path, recalls: bool
 ) -> None:
     """As in the fields that are shown."""
-    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
-    topic = "/fmu/out/vehicle_odometry"
+    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n) for n in range(9)])
+    of_vehicle = partial(ask, tmp_path, recalls, topic=VEHICLE)
     for field, value, last in (
         ("velocity.0", 0.5, 8),
         ("position.0", 5, 5),
         ("position.2", 1, None),
     ):
-        given = {"topic": topic, "field": field, "condition_type": "equals", "value": value}
-        found = ask(tmp_path, recalls, "find_last_match", **given)
+        given = {"field": field, "condition_type": "equals", "value": value}
+        found = of_vehicle("find_last_match", **given)
         assert (None if found is None else found["timestamp"] - T0_S) == last
-    shown = ask(
-        tmp_path, recalls, "get_topic_at_time", topic=topic, timestamp=T0_S, fields=["velocity.0"]
-    )
+    shown = of_vehicle("get_topic_at_time", timestamp=T0_S, fields=["velocity.0"])
     assert shown["value"] == {"velocity.0": 0.5}
 
 
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
-    topic, above = "/fmu/out/vehicle_odometry", {"condition_type": "above", "value": 1.0}
+    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n) for n in range(9)])
+    above = {"topic": "/*odometry", "condition_type": "above", "value": 1.0, "field": "position.z"}
     note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 1}),
         ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
-        ("find_matches", {"topic": topic, **above, "field": "position.z"}),
-        ("find_last_match", {"topic": topic, **above, "field": "position.z"}),
+        ("find_matches", above),
+        ("find_last_match", above),
     ):
         assert note in ask(tmp_path, False, tool, **given)["notes"]
-    other = [replace(vehicle(T0 + n * S, n, 0.0), topic="/r2/odometry") for n in range(9)]
+    other = [vehicle(T0 + n * S, n, "/r2/odometry") for n in range(9)]
     write_mcap(tmp_path / "other.mcap", other)
-    several = {"topic": "/*odometry", **above, "field": "position.z"}
-    assert ask(tmp_path, False, "find_matches", **several)["notes"].count(note) == 1
+    assert ask(tmp_path, False, "find_matches", **above)["notes"].count(note) == 1
 
 
 def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> None:
@@ -179,9 +175,9 @@ def moved(tenths: range) -> list[Msg]:
     """The body driving at 1 m/s in the map, ten transforms a second, from 1 m on."""
     return [
         tf(
-            T0 + n * S // 10,
-            transform(T0 + n * S // 10, "map", "odom", (1.0, 0.0, 0.0)),
-            transform(T0 + n * S // 10, "odom", "base_link", (n / 10, 0.0, 0.0)),
+            at := T0 + n * S // 10,
+            transform(at, "map", "odom", (1.0, 0.0, 0.0)),
+            transform(at, "odom", "base_link", (n / 10, 0.0, 0.0)),
         )
         for n in tenths
     ]
@@ -215,15 +211,13 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
-        tf(T0 + n * S, *(transform(T0 + n * S, *pair, (x, 0.0, 0.0)) for pair, x in edges))
+        tf(
+            at := T0 + n * S,
+            transform(at, "map", "one/base_link", (n, 0.0, 0.0)),
+            transform(at, "one/base_link", "one/arm/base_link", (0.1 * n, 0.0, 0.0)),
+            transform(at, "map", "two/base_link", (5.0, 0.0, 0.0)),
+        )
         for n in range(9)
-        for edges in [
-            [
-                (("map", "one/base_link"), n),
-                (("one/base_link", "one/arm/base_link"), 0.1 * n),
-                (("map", "two/base_link"), 5.0),
-            ]
-        ]
     ]
     write_mcap(tmp_path / "rec_0" / "rec_0_0.mcap", messages)
     notes = ask(tmp_path, False, "visits", x=5.0, y=0.0)["notes"]

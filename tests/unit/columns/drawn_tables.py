@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
@@ -34,7 +34,7 @@ from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
 
-VISION_MSGS: Final = {
+VISION_MSGS = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
     "vision_msgs/msg/ObjectHypothesisWithPose": (
         "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
@@ -54,7 +54,7 @@ VISION_MSGS: Final = {
     ),
     "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
 }
-UNMAPPED: Final = {
+UNMAPPED = {
     "own_msgs/msg/Seen": "string label\nstring class_name\nfloat32 confidence\nstring attributes\n",
     "own_msgs/msg/Guess": "string label\nfloat64 score\nint8 probability\n",
     "own_msgs/msg/Nested": "Seen seen\nGuess[] results\nSeen[] others\ngeometry_msgs/Point at\n",
@@ -74,7 +74,7 @@ UNMAPPED: Final = {
     ),
     "own_msgs/msg/PosedArray": "std_msgs/Header header\nPosed[] objects\n",
 }
-MAPPED: Final = (
+MAPPED = (
     "nav_msgs/msg/Odometry",
     "nav_msgs/msg/Path",
     "geometry_msgs/msg/PoseStamped",
@@ -99,7 +99,7 @@ MAPPED: Final = (
     "std_msgs/msg/Int64",
     "std_msgs/msg/Float32",
 )
-OTHERS: Final = (
+OTHERS = (
     "own_msgs/msg/Everything",
     "own_msgs/msg/Nested",
     "own_msgs/msg/Label",
@@ -111,9 +111,9 @@ OTHERS: Final = (
     "std_msgs/msg/Float64MultiArray",
     "sensor_msgs/msg/CompressedImage",
 )
-ROWS: Final = 6
+ROWS = 6
 
-_WORDS: Final = (
+_WORDS = (
     *(
         "",
         " ",
@@ -135,10 +135,10 @@ _WORDS: Final = (
     '{"label": "gr\\u00f6\\u00dfer", "text": "say \\"hi\\""}',
     '{"label": "cup", "score": 0.3, "point": {"x": 1, "y": 2, "z": 0}}',
 )
-_REALS: Final = (0.0, -0.0, 1.0, -1.0, 0.5, 0.3, 0.1, 0.7071067811865476, 2.5, 1e9, 1e-300, 1e200)
-_ODD: Final = (math.nan, math.inf, -math.inf)
-_EXTENT: Final = {"int8": 7, "byte": 7, "int16": 15, "int32": 31, "int64": 63}
-_EXTENT_UNSIGNED: Final = {"uint8": 8, "char": 8, "uint16": 16, "uint32": 32, "uint64": 64}
+_REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 0.3, 0.1, 0.7071067811865476, 2.5, 1e9, 1e-300, 1e200)
+_ODD = (math.nan, math.inf, -math.inf)
+_EXTENT = {"int8": 7, "byte": 7, "int16": 15, "int32": 31, "int64": 63}
+_EXTENT_UNSIGNED = {"uint8": 8, "char": 8, "uint16": 16, "uint32": 32, "uint64": 64}
 
 
 @cache
@@ -181,7 +181,7 @@ def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     return Drawn(table, [reader.decode(record) for record in records])
 
 
-_READER: Final = McapReader()
+_READER = McapReader()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

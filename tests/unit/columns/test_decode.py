@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pytest
@@ -36,12 +35,12 @@ from tests.support.reader_cases import read_through
 from tests.support.shared_bags import REAL, needs_real
 from tests.unit.columns.drawn_tables import message_in
 
-NUMBERS: Final = (
+NUMBERS = (
     *("bool", "byte", "char", "int8", "uint8", "int16", "uint16", "int32", "uint32"),
     *("int64", "uint64", "float32", "float64"),
 )
 TIME, DURATION = "builtin_interfaces/Time", "builtin_interfaces/Duration"
-_IDL: Final = {
+_IDL = {
     "bool": "boolean",
     "byte": "octet",
     "char": "uint8",
@@ -51,7 +50,7 @@ _IDL: Final = {
     DURATION: "builtin_interfaces::msg::Duration",
 }
 
-_TIME_TEXT: Final = "int32 sec\nuint32 nanosec\n"
+_TIME_TEXT = "int32 sec\nuint32 nanosec\n"
 
 
 @dataclass(frozen=True)
@@ -132,9 +131,9 @@ def _idl(name: str, fields: Sequence[DrawnField]) -> str:
     return f"struct {name} {{ {' '.join(lines)} }};"
 
 
-_PRIMITIVES: Final = st.sampled_from([*NUMBERS, "string", "string", TIME, DURATION])
+_PRIMITIVES = st.sampled_from([*NUMBERS, "string", "string", TIME, DURATION])
 
-_LENGTHS: Final = st.one_of(
+_LENGTHS = st.one_of(
     st.none(), st.none(), st.just(-1), st.just(-1), st.sampled_from((1, 3, 9, 12, 600))
 )
 
@@ -315,7 +314,7 @@ def groups_of(path: Path) -> Iterator[list[Table]]:
     return map(Group.tables, undecoded(McapReader(), path))
 
 
-LONG_TYPES: Final = DrawnTypes(
+LONG_TYPES = DrawnTypes(
     (
         ("Point", (DrawnField("x", "float64"), DrawnField("kind", "uint8"))),
         ("Named", (DrawnField("label", "string"), DrawnField("points", "Point", -1))),

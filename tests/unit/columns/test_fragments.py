@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ class Words(NamedTuple):
         return 100
 
 
-WORDS: Final[FragmentKind[Words]] = FragmentKind("words", (Words,))
+WORDS = FragmentKind("words", (Words,))
 
 
 def counted(bag_dir: Path, where: str, *given: bytes) -> int:

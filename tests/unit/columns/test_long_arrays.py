@@ -5,7 +5,6 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 from random import Random
-from typing import Final
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from tests.support.bags import (
 )
 from tests.support.memories import asked, each_way, memory_of, with_store
 
-T0: Final = 1_790_000_000 * NS_PER_S
+T0 = 1_790_000_000 * NS_PER_S
 
 
 def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:

@@ -57,7 +57,7 @@ def floats(draw: st.DrawFn) -> Values:
         return np.array(numbers).astype(draw(st.sampled_from(["float32", "float64"])))
 
 
-@settings(max_examples=examples(300), deadline=None)
+@settings(max_examples=examples(300))
 @given(integers)
 @example(np.array([2**64 - 1, 0, 2**63, 2**63 - 1], np.uint64))
 @example(np.array([2**63 - 2, 2**63 + 5, 2**63], np.uint64))
@@ -72,7 +72,7 @@ def test_integers_come_back_as_they_were(column: Values) -> None:
 
 
 @pytest.mark.parametrize("step", [EXACT, RELATIVE, METRES, QUATERNION, DEGREES], ids=str)
-@settings(max_examples=examples(200), deadline=None)
+@settings(max_examples=examples(200))
 @given(column=floats())
 def test_floats_are_off_by_no_more_than_stated_and_half_a_step(step: Step, column: Values) -> None:
     packed = pack(column, step)
@@ -93,7 +93,7 @@ def allowed(step: Step, values: Values) -> Values:
     return np.abs(values.astype(np.float64)) * (MOST_RELATIVE if step.relative else 0.0)
 
 
-@settings(max_examples=examples(200), deadline=None)
+@settings(max_examples=examples(200))
 @given(st.lists(st.text(st.characters(codec=None), max_size=6), max_size=30))
 def test_texts_come_back_as_they_were(values: list[str]) -> None:
     column = Texts.of(values)
@@ -169,7 +169,7 @@ ZONES = st.one_of(
 )
 
 
-@settings(max_examples=examples(300), deadline=None)
+@settings(max_examples=examples(300))
 @given(integers | floats())
 def test_zones_are_exact(column: Values) -> None:
     zone = pack(column, METRES).zone

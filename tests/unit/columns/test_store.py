@@ -214,11 +214,11 @@ def write_secret(bag_dir: Path, number: int) -> Path:
     return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
 
 
-def secrets(number: int) -> list[bytes]:
-    """What one bag alone says: texts of its messages, a topic, its name, and when it begins."""
-    texts = [f"secret{number:04d}", f"{number:04d}x0", f"{number:04d}x20", f"{number:04d}x40"]
-    texts += [f"/only/{number:04d}", f"rec/rec_{number}.mcap"]
-    return [*(each.encode() for each in texts), (T0 + number * 60 * S).to_bytes(8, "big")]
+SECRETS = (
+    *(b"secret0003", b"0003x0", b"0003x20", b"0003x40", b"/only/0003", b"rec/rec_3.mcap"),
+    (T0 + 3 * 60 * S).to_bytes(8, "big"),
+)
+"""What one bag alone says: texts of its messages, a topic, its name, and when it begins."""
 
 
 def values(file: Path) -> dict[str, list[bytes]]:
@@ -269,7 +269,7 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     file = store_file(tmp_path)
     before = {table: slices_of(some) for table, some in values(file).items()}
     there = bytes_of(file.parent) + all_unpacked(file)
-    assert [secret for secret in secrets(3) if secret not in there] == []
+    assert [secret for secret in SECRETS if secret not in there] == []
     # The store stays open in a server, so that its log lies beside it.
     forget(file, tmp_path, ["rec/rec_3.mcap"])
     left = bytes_of(file.parent)
@@ -283,7 +283,7 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     of_bags = {"bag", "summary", "topic", "definition", "part", "part_column", "zone"}
     assert gone.keys() == of_bags | ({"fragment"} if merged else set())
     assert [part for some in gone.values() for part in some if part in left] == []
-    assert [secret for secret in secrets(3) if secret in left + all_unpacked(file)] == []
+    assert [secret for secret in SECRETS if secret in left + all_unpacked(file)] == []
     assert "rec/rec_3.mcap" not in world.stored()
     assert "rec/rec_12.mcap" in world.stored()
     assert check_all(world) == 14 * 121
@@ -356,7 +356,7 @@ def test_a_topic_that_is_stored_later_is_taken_for_none_that_was_forgotten(tmp_p
 
 @cache
 def section() -> str:
-    text = (ROOT / "docs/reference/files.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/reference/files.md").read_text()
     return text.partition("## The store of columns")[2]
 
 

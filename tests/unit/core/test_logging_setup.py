@@ -34,29 +34,20 @@ def events(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
     return [json.loads(line) for line in err.splitlines()]
 
 
-def fail(reason: str) -> None:
-    secret = "hunter" + str(len("ab"))
-    assert secret
-    raise ValueError(reason)
-
-
-def log_failure(reason: str) -> None:
-    try:
-        fail(reason)
-    except ValueError:
-        get_logger("ours").exception("scan failed")
-
-
 @pytest.mark.parametrize("layout", ["json", "pretty"])
 def test_an_exception_does_not_show_local_variables(
-    layout: str, capsys: pytest.CaptureFixture[str]
+    layout: Literal["json", "pretty"], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    configure_logging("info", "json" if layout == "json" else "pretty")
-    log_failure("bad bag")
+    configure_logging("info", layout)
+    secret = f"hunter{1 + 1}"
+    try:
+        int("a bad bag")
+    except ValueError:
+        get_logger("ours").exception("scan failed")
     out, err = capsys.readouterr()
     assert out == ""
-    assert "ValueError: bad bag" in err
-    assert "hunter2" not in err
+    assert "ValueError: invalid literal" in err
+    assert secret not in err
 
 
 def test_what_a_library_repeats_is_logged_now_and_then(

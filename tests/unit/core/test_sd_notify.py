@@ -5,18 +5,7 @@ import socket
 
 import pytest
 
-from ros2_memory.core.sd_notify import (
-    STOPPING,
-    notify,
-    watchdog_interval_s,
-)
-
-
-def set_only(monkeypatch: pytest.MonkeyPatch, env: dict[str, str]) -> None:
-    for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in env.items():
-        monkeypatch.setenv(name, value)
+from ros2_memory.core.sd_notify import STOPPING, notify, watchdog_interval_s
 
 
 def test_it_is_told_over_an_abstract_socket_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,5 +31,5 @@ def test_it_is_told_over_an_abstract_socket_too(monkeypatch: pytest.MonkeyPatch)
 def test_it_is_not_told_what_it_does_not_ask_for(
     env: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    set_only(monkeypatch, env)
+    monkeypatch.setattr(os, "environ", env)
     assert watchdog_interval_s() is None

@@ -1,7 +1,6 @@
 """What observers receive for each call."""
 
 from ros2_memory.core.telemetry import Answered, Observer, Telemetry
-from ros2_memory.serving.dispatch import Dispatcher
 from tests.unit.serving.test_dispatch import served, tool, value
 
 
@@ -10,10 +9,7 @@ class Failing(Observer):
         raise RuntimeError("the observer's own fault")
 
 
-def dispatcher(observer: Observer) -> Dispatcher:
-    return served(tool("good", lambda _: value(7)), telemetry=Telemetry((observer,))).dispatcher
-
-
 async def test_an_observer_that_fails_costs_no_answer() -> None:
-    reply = await dispatcher(Failing()).answer("good", {})
-    assert not reply.is_error
+    good = tool("good", lambda _: value(7))
+    dispatcher = served(good, telemetry=Telemetry((Failing(),))).dispatcher
+    assert not (await dispatcher.answer("good", {})).is_error

@@ -35,15 +35,11 @@ OFFSETS = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(
 
 
 @pytest.fixture(params=ZONES)
-def zone(request: pytest.FixtureRequest) -> Iterator[str]:
-    yield from in_zone(request.param)
-
-
-def in_zone(name: str) -> Iterator[str]:
+def zone(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", name)
+        patch.setenv("TZ", request.param)
         time.tzset()
-        yield name
+        yield
     time.tzset()
 
 

@@ -5,7 +5,7 @@ from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
@@ -16,23 +16,9 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.counts.bins import (
-    MOST_BINS,
-    MOST_DAYS,
-    ClockBin,
-    Offset,
-    TimeBins,
-    time_bins,
-)
+from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, Offset, TimeBins, time_bins
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import (
-    boolean,
-    detections,
-    odom,
-    text,
-    write_mcap,
-    write_splits,
-)
+from tests.support.bags import boolean, detections, odom, text, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
@@ -54,12 +40,13 @@ def zone(name: str) -> Offset:
     return offset
 
 
-def at(text: str, zone_name: str = "UTC") -> int:
-    return int(datetime.fromisoformat(text).replace(tzinfo=ZoneInfo(zone_name)).timestamp()) * S
-
-
-def hours(bins: TimeBins) -> dict[str, float]:
-    found = bins.lengths([bins.edges[0]], [bins.edges[-1]]) @ bins.member
+def hours(by: ClockBin, *days: str) -> dict[str, float]:
+    """How long each bin is from the beginning of one day to that of another, in Berlin."""
+    dates = (datetime.fromisoformat(f"2026-{day}") for day in days)
+    times = [each.replace(tzinfo=ZoneInfo("Europe/Berlin")).timestamp() for each in dates]
+    start, stop = (int(time) * S for time in times)
+    bins = time_bins(TimeWindow(start, stop), by, zone("Europe/Berlin"))
+    found = bins.lengths([start], [stop]) @ bins.member
     return {name: int(length) / S / H for name, length in zip(bins.names, found, strict=True)}
 
 
@@ -103,32 +90,23 @@ def test_spans_are_shared_out_without_loss(
 
 
 def test_a_day_has_23_or_25_hours_where_clocks_are_changed() -> None:
-    berlin = zone("Europe/Berlin")
-    spring = TimeWindow(at("2026-03-28", "Europe/Berlin"), at("2026-03-31", "Europe/Berlin"))
-    assert hours(time_bins(spring, "day", berlin)) == {
-        "2026-03-28": 24,
-        "2026-03-29": 23,
-        "2026-03-30": 24,
-    }
-    autumn = TimeWindow(at("2026-10-25", "Europe/Berlin"), at("2026-10-26", "Europe/Berlin"))
-    assert hours(time_bins(autumn, "day", berlin)) == {"2026-10-25": 25}
-    by_hour = hours(time_bins(autumn, "hour", berlin))
-    assert by_hour["02:00"] == 2
-    assert sum(by_hour.values()) == 25
-    skipped = TimeWindow(at("2026-03-29", "Europe/Berlin"), at("2026-03-30", "Europe/Berlin"))
-    assert "02:00" not in hours(time_bins(skipped, "hour", berlin))
+    spring = hours("day", "03-28", "03-31")
+    assert spring == {"2026-03-28": 24, "2026-03-29": 23, "2026-03-30": 24}
+    assert hours("day", "10-25", "10-26") == {"2026-10-25": 25}
+    by_hour = hours("hour", "10-25", "10-26")
+    assert (by_hour["02:00"], sum(by_hour.values())) == (2, 25)
+    assert "02:00" not in hours("hour", "03-29", "03-30")
 
 
 def test_more_bins_than_a_reply_has_room_for_are_refused() -> None:
-    begin, day = at("2026-03-02"), 86_400 * S
-    assert (
-        len(time_bins(TimeWindow(begin + S, begin + MOST_BINS * day), "day", zone("UTC")).names)
-        == MOST_BINS
-    )
+    def bins(by: ClockBin, days: int) -> TimeBins:
+        return time_bins(TimeWindow(1, days * 86_400 * S), by, zone("UTC"))
+
+    assert len(bins("day", MOST_BINS).names) == MOST_BINS
     with pytest.raises(InvalidArgumentsError, match=r"by day takes at most 62 days.*by weekday"):
-        time_bins(TimeWindow(begin, begin + (MOST_BINS + 2) * day), "day", zone("UTC"))
+        bins("day", MOST_BINS + 2)
     with pytest.raises(InvalidArgumentsError, match="by hour takes at most 1000 days"):
-        time_bins(TimeWindow(begin, begin + (MOST_DAYS + 1) * day), "hour", zone("UTC"))
+        bins("hour", MOST_DAYS + 2)
 
 
 def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> None:
@@ -269,7 +247,7 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 
 
-T: Final = 1_790_000_000
+T = 1_790_000_000
 
 
 @each_way

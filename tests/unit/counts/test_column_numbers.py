@@ -31,8 +31,10 @@ def write(folder: Path, messages: list[Msg], split: int = 20) -> None:
         write_mcap(folder / "rec" / name, messages[number : number + split])
 
 
-def span(hours: float = 3) -> TimeRange:
-    return TimeRange(BEGIN / S, BEGIN / S + hours * HOUR)
+def charges(memory: Memory, call: Call) -> Bins:
+    """What the battery stated in three hours."""
+    span = TimeRange(BEGIN / S, BEGIN / S + 3 * HOUR)
+    return count_range(memory, call, "/battery_state", span, "hour", fields=["percentage"])
 
 
 def cells(answer: Bins, name: str) -> list[float | None]:
@@ -46,7 +48,7 @@ def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
     messages = [battery(BEGIN + n * 10 * S, 0.5 + n / 10_000) for n in range(1080)]
     write(tmp_path, messages, split=60)
     memory = memory_of(tmp_path, limits=LATEST)
-    whole = count_range(memory, Call(), "/battery_state", span(), "hour", fields=["percentage"])
+    whole = charges(memory, Call())
     looks = iter([False] * 3)
 
     class Hurried(Deadline):
@@ -54,7 +56,7 @@ def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
             return next(looks, True)
 
     monkeypatch.setattr(Call, "partial_after", lambda *_: Hurried(0.0, math.inf))
-    part = count_range(memory, Call(), "/battery_state", span(), "hour", fields=["percentage"])
+    part = charges(memory, Call())
     assert len(whole.rows) == 3
     assert [name for name, _ in part.rows] == [whole.rows[-1][0]]
     assert cells(part, "count") == [180, 180]
@@ -91,10 +93,7 @@ def sizes_counted(memory: Memory, looks: Iterable[int]) -> set[int]:
     sizes = set()
     for most in looks:
         with suppress(QueryTimeoutError):
-            call = Call(deadline=limited(most))
-            answer = count_range(
-                memory, call, "/battery_state", span(), "hour", fields=["percentage"]
-            )
+            answer = charges(memory, Call(deadline=limited(most)))
             size = int(cells(answer, "count")[-1] or 0)
             assert cells(answer, "percentage.min_at")[-1] == CHARGES[-size].log_time
             mean = pytest.approx(0.5 + (1199 - size) / 20_000, abs=1e-6)
@@ -109,10 +108,7 @@ def test_no_number_is_lost_where_time_runs_out_after_all_are_counted(tmp_path: P
     counted = [0]
     for looks in range(1, 30):
         with suppress(QueryTimeoutError):
-            call = Call(deadline=limited(looks))
-            answer = count_range(
-                memory, call, "/battery_state", span(), "hour", fields=["percentage"]
-            )
+            answer = charges(memory, Call(deadline=limited(looks)))
             counted.append(int(cells(answer, "count")[-1] or 0))
             continue
         assert counted[-1] == 0, looks
@@ -190,12 +186,7 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
 def test_a_field_that_a_topic_has_no_more_is_that_of_its_window(tmp_path: Path) -> None:
     said = [replace(text(BEGIN + HOUR * S, "full"), topic="/battery_state")]
     write(tmp_path, [battery(BEGIN, math.nan), *said], split=1)
-    answer = count_range(
-        memory_of(tmp_path),
-        Call(),
-        "/battery_state",
-        TimeRange(BEGIN / S, BEGIN / S + 60),
-        "hour",
-        fields=["percentage"],
-    )
+    span = TimeRange(BEGIN / S, BEGIN / S + 60)
+    fields = {"fields": ["percentage"]}
+    answer = count_range(memory_of(tmp_path), Call(), "/battery_state", span, "hour", **fields)
     assert "percentage holds no number in the window" in answer.notes

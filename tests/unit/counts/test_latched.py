@@ -1,20 +1,12 @@
 """How long a state lasts that one message states, and no other message repeats."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ros2_memory.history.context import Memory, QuerySettings
-from tests.support.bags import (
-    McapLayout,
-    boolean,
-    detections,
-    odom,
-    text,
-    write_mcap,
-    write_splits,
-)
+from tests.support.bags import McapLayout, boolean, odom, text, write_mcap, write_splits
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
@@ -36,11 +28,12 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def matches(bag_dir: Path, topic: str, first: float, last: float, **more: object) -> Any:
-    given = {"topic": topic, "condition_type": "equals", "start": T0 / S + first, **more}
-    recalls = bool(given.pop("recalls"))
+def matches(
+    bag_dir: Path, topic: str, first: float, last: float, *, recalls: bool, **more: object
+) -> Any:
+    given = {"topic": topic, "condition_type": "equals", "value": True, **more}
     memory = memory_of(bag_dir, recalls=recalls)
-    return asked(memory, "find_matches", value=True, end=T0 / S + last, **given)
+    return asked(memory, "find_matches", start=T0 / S + first, end=T0 / S + last, **given)
 
 
 @each_way
@@ -139,29 +132,15 @@ UNSET = 86_400
 AHEAD = 2_082_758_400
 
 
-@pytest.fixture
-def memory(tmp_path: Path) -> Memory:
-    """Six messages of today, two of 1970 and one of 2036, of each topic."""
-    for name, begin, count in (("unset", UNSET, 2), ("today", TRUE, 6), ("ahead", AHEAD, 1)):
-        messages = [odom((begin + n) * S, n, 0.0) for n in range(count)]
-        messages += [boolean((begin + n) * S + 1, data=n % 2 == 0) for n in range(count)]
-        messages += [detections((begin + n) * S + 2, ["cup"]) for n in range(count)]
-        messages += [text((begin + n) * S + 3, "idle" if n < 3 else "busy") for n in range(count)]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
-    return memory_of(tmp_path, clock=FixedClock((TRUE + 600) * S), limits=QuerySettings())
-
-
-def whole(by: str = "hour") -> dict[str, object]:
-    return {"start": 0, "end": AHEAD + 10, "by": by}
-
-
-def test_no_value_holds_from_one_clock_to_the_next(memory: Memory) -> None:
+def test_no_value_holds_from_one_clock_to_the_next(tmp_path: Path) -> None:
     """The robot was idle at the end of 1970, and at the beginning of today."""
-    reply = asked(memory, "get_topic_in_range", topic="/chatter", **whole("value"))
-    rows = table(reply)
+    for name, begin, count in (("unset", UNSET, 2), ("today", TRUE, 6), ("ahead", AHEAD, 1)):
+        said = [text((begin + n) * S, "idle" if n < 3 else "busy") for n in range(count)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", said)
+    memory = memory_of(tmp_path, clock=FixedClock((TRUE + 600) * S))
+    of_topic = partial(asked, memory, "get_topic_in_range", topic="/chatter", by="value")
+    rows = table(of_topic(start=0, end=AHEAD + 10))
     assert {value: row["count"] for value, row in rows.items()} == {"idle": 1, "busy": 1, "all": 2}
-    assert rows["idle"]["first_unix"] == pytest.approx(TRUE, abs=0.001)
-    assert rows["busy"]["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
-    of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
-    reply = asked(memory, "get_topic_in_range", topic="/chatter", **of_1970)
-    assert table(reply)["all"]["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
+    assert (rows["idle"]["first_unix"], rows["busy"]["last_unix"]) == (TRUE, TRUE + 5)
+    of_1970 = table(of_topic(start=UNSET - 5, end=UNSET + 60))
+    assert of_1970["all"]["last_unix"] == UNSET + 1

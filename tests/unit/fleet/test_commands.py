@@ -39,18 +39,13 @@ def test_what_looks_at_one_robot_asks_which(robots: str, tmp_path: Path, exits: 
     assert "/is_docked" in exits(0, f"topics --json --bag-dir {tmp_path}/r1", robots).out
 
 
-def test_ask_reports_no_other_folder(robots: str, exits: Program) -> None:
-    assert not exits(0, "ask list_frames robot=r1", robots).err
-
-
-@pytest.mark.parametrize("robot", [["robot=r1"], ["robot=r1, away"], []])
 def test_ask_counts_times_from_the_newest_data_of_the_robots_asked(
-    robots: str, exits: Program, robot: list[str]
+    robots: str, exits: Program
 ) -> None:
-    words = [robots, "data.now=latest", *robot]
-    told = exits(0, "ask recap --json start=10s end=now", *words).json
-    rows = [row for row in told.get("robots", [told]) if row.get("robot_name") != "away"]
-    assert [row["distance_m"] > 0 for row in rows] == [True]
-    if robot == ["robot=r1"]:
-        at = exits(0, "ask get_position_at --json timestamp=10s", *words).json
-        assert at["timestamp"] == seeded("r1").end_s - 10
+    for robot in (["robot=r1"], ["robot=r1, away"], []):
+        words = [robots, "data.now=latest", *robot]
+        told = exits(0, "ask recap --json start=10s end=now", *words).json
+        rows = [row for row in told.get("robots", [told]) if row.get("robot_name") != "away"]
+        assert [row["distance_m"] > 0 for row in rows] == [True]
+    asked = exits(0, "ask get_position_at --json timestamp=10s robot=r1", robots, "data.now=latest")
+    assert (asked.json["timestamp"], asked.err) == (seeded("r1").end_s - 10, "")

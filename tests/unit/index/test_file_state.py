@@ -125,7 +125,7 @@ def test_a_file_is_written_closed_or_left_by_a_crash(
 ) -> None:
     path = plain(tmp_path / name, [1, 2], closed=closed)
     if name.startswith("listed/"):
-        path.with_name("metadata.yaml").write_text(METADATA, encoding="utf-8")
+        path.with_name("metadata.yaml").write_text(METADATA)
     assert scan.run(path, age_s=age_s, names=names) is state
     assert scan.is_watched or state is CLOSED
     assert scan.is_watched or names != {"rec_2"}
@@ -181,7 +181,7 @@ def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = tmp_path / "rec_0.mcap"
-    path.write_text("junk", encoding="utf-8")
+    path.write_text("junk")
     scan.run(path, age_s=100)
     for later, tries in ((RETRY_NS - 1, 1), (RETRY_NS, 2)):
         scan.run(path, now=NOW + later)

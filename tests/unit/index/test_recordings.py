@@ -106,12 +106,12 @@ def test_times_that_recordings_share_are_those_of_all_their_bags(
 T0_NS = T0 * NS_PER_S
 
 
-def listed_recording(bag_dir: Path, name: str = "r", *, messages: int = 1) -> Memory:
-    """A listed_recording of five splits, of which two are missing, as another program left it."""
+def listed_recording(bag_dir: Path) -> Memory:
+    """A recording of five splits, of which two are missing, as another program left it."""
     for n in (0, 2, 4):
-        write_mcap(bag_dir / name / f"r_{n}.mcap", [text(T0_NS + n, "a")])
-    files = "".join(f"  - path: r_{n}.mcap\n    message_count: {messages}\n" for n in range(5))
-    listing = bag_dir / name / "metadata.yaml"
+        write_mcap(bag_dir / "r" / f"r_{n}.mcap", [text(T0_NS + n, "a")])
+    files = "".join(f"  - path: r_{n}.mcap\n    message_count: 7\n" for n in range(5))
+    listing = bag_dir / "r" / "metadata.yaml"
     listing.write_text(f"rosbag2_bagfile_information:\n  files:\n{files}")
     for each in (listing, listing.parent):
         os.utime(each, (T0, T0))
@@ -132,7 +132,7 @@ def test_what_changed_since_is_read_again(tmp_path: Path) -> None:
 
 
 def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    memory = with_store(listed_recording(tmp_path, messages=7), tmp_path)
+    memory = with_store(listed_recording(tmp_path), tmp_path)
     [absent] = absent_of(memory)
     memory.store_listings(memory.index.snapshot())
     monkeypatch.setattr(listed_splits, "read_listing", None)

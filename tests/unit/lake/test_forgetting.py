@@ -122,13 +122,12 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
 
 
 @pytest.fixture
-def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path, Path]:
-    """A robot's bags in a lake, and a late copy of the one with the marker."""
+def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A robot's bags in a lake, of which one has the marker."""
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
     write_bag(bag_dir, 6)
-    late = tmp_path / "late.mcap"
-    shutil.copy(secret_bag(bag_dir, 7, odom((START_S + 72) * NS_PER_S, 0.0, 0.0)), late)
+    secret_bag(bag_dir, 7, odom((START_S + 72) * NS_PER_S, 0.0, 0.0))
     for path in bag_dir.rglob("*.mcap"):
         os.utime(path, (START_S, START_S))  # nobody writes it any more
     own_all(bag_dir)
@@ -136,7 +135,7 @@ def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     ship_from(tmp_path)
     assert files_with(lake, MARKER)
-    return bag_dir, lake, late
+    return bag_dir, lake
 
 
 def forget_on_robot(*more: str) -> int:
@@ -145,9 +144,9 @@ def forget_on_robot(*more: str) -> int:
 
 
 def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
-    shipped_robot: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str]
+    shipped_robot: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag_dir, lake, _ = shipped_robot
+    bag_dir, lake = shipped_robot
     assert forget_on_robot() == 0
     assert "next pass of ros2-memory ship" in capsys.readouterr().out
     done = ship_from(lake.parent)
@@ -160,10 +159,10 @@ def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
 
 
 def test_what_is_forgotten_is_in_no_byte_of_the_columns_that_were_stored_to_ship_it(
-    shipped_robot: tuple[Path, Path, Path],
+    shipped_robot: tuple[Path, Path],
 ) -> None:
     """Also where the bag that had it was written again, and shares parts with others."""
-    bag_dir, lake, _ = shipped_robot
+    bag_dir, lake = shipped_robot
     cache = lake.parent / "cache" / FILE
 
     def ship_with_cache() -> Shipped:
@@ -193,16 +192,18 @@ def test_columns_that_cannot_be_forgotten_are_named(tmp_path: Path) -> None:
 
 
 def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_comes_again(
-    shipped_robot: tuple[Path, Path, Path],
+    shipped_robot: tuple[Path, Path],
 ) -> None:
-    bag_dir, lake, late = shipped_robot
+    bag_dir, lake = shipped_robot
+    kept = bag_dir / "rec" / "rec_7.mcap"
+    late = shutil.copy(kept, lake.parent / "late.mcap")
     [topic] = {str(topic) for topic in lake_column(lake, "sightings", "topic")}
     assert forget_on_robot("--topic", "/chatter", "--topic", topic) == 0
     done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 1, [])
     assert len(lake_column(lake, "bags", "bag_id")) == 3
     assert files_with(lake, MARKER) == []
-    shutil.copy(late, bag_dir / "rec" / "rec_7.mcap")
+    shutil.copy(late, kept)
     assert any("rec_7" in problem for problem in ship_again(lake).problems)
     assert files_with(lake, MARKER) == []
     # Bags of that time without such a topic stay.
@@ -212,10 +213,9 @@ def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_
 
 
 def test_where_the_robot_cannot_write_it_down_the_lake_keeps_it_and_the_command_is_named(
-    shipped_robot: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str]
+    shipped_robot: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag_dir, _, _ = shipped_robot
-    (bag_dir / FORGOTTEN_FILE).mkdir()  # as on a read-only disk
+    (shipped_robot[0] / FORGOTTEN_FILE).mkdir()  # as on a read-only disk
     assert forget_on_robot() == 1
     told = capsys.readouterr().out
     assert f"--forget ROBOT --start {START_S + 70} --end {START_S + 73}`" in told
@@ -251,19 +251,18 @@ def test_killed_while_shipping_and_while_forgetting_it_is_finished_later(
             raise OSError(28, "No space left on device")
         return commit(*given)  # type: ignore[arg-type]
 
-    where = location(lake)
-    with monkeypatch.context() as patched:
-        patched.setattr(SqlCatalog, "commit_table", failing)
-        with pytest.raises(LakeError, match="No space left"):
-            ship_from(tmp_path)
-        # Its rows are there, but in `bags`.
-        assert files_with(lake, MARKER)
-        left = 3
-        with pytest.raises(LakeError, match="No space left"):
-            forget(lake, TOMBSTONE)
-    assert [(row, row.done) for row in read_tombstones(where.state_dir)] == [(TOMBSTONE, False)]
+    monkeypatch.setattr(SqlCatalog, "commit_table", failing)
+    with pytest.raises(LakeError, match="No space left"):
+        ship_from(tmp_path)
+    # Its rows are there, but in `bags`.
+    assert files_with(lake, MARKER)
+    left = 3
+    with pytest.raises(LakeError, match="No space left"):
+        forget(lake, TOMBSTONE)
+    left = 10**6
+    assert tombstones(location(lake).state_dir) == [(TOMBSTONE, False)]
     assert forget(lake, TOMBSTONE).bags == 1
-    assert [(row, row.done) for row in read_tombstones(where.state_dir)] == [(TOMBSTONE, True)]
+    assert tombstones(location(lake).state_dir) == [(TOMBSTONE, True)]
     assert files_with(lake, MARKER) == []
 
 
@@ -354,14 +353,18 @@ def test_what_another_program_writes_while_a_day_is_put_together_stays(
     assert after == {name: rows + (name in others) for name, rows in before.items()}
 
 
+def tombstones(state_dir: Path) -> list[tuple[Tombstone, bool]]:
+    return [(row, row.done) for row in read_tombstones(state_dir)]
+
+
 def test_a_damaged_tombstone_keeps_everything_from_being_shipped(tmp_path: Path) -> None:
     append_tombstone(tmp_path, TOMBSTONE, done=False)
     path = tmp_path / TOMBSTONES_FILE
     # A crash cut the last line short.
     path.write_text(path.read_text() + '{"robot": "ha')
-    assert [(row, row.done) for row in read_tombstones(tmp_path)] == [(TOMBSTONE, False)]
+    assert tombstones(tmp_path) == [(TOMBSTONE, False)]
     append_tombstone(tmp_path, TOMBSTONE, done=True)
-    assert [(row, row.done) for row in read_tombstones(tmp_path)] == [(TOMBSTONE, True)]
+    assert tombstones(tmp_path) == [(TOMBSTONE, True)]
     path.write_text('{"robot": 1}\n' + path.read_text())
     with pytest.raises(LakeError, match="line 1"):
         read_tombstones(tmp_path)

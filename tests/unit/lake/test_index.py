@@ -1,8 +1,8 @@
 """What is read again of a lake, and what stays, when more is shipped; how far back searches go."""
 
+import re
 from collections.abc import Iterable, Sequence
 from datetime import date, timedelta
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,6 @@ from ros2_memory.lake.memory import LakeIndex, newest_days
 from ros2_memory.lake.tables import NAMESPACE, TABLES, day_of, open_tables
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import Days, LakeFile
-from ros2_memory.queries import find_last_match
-from ros2_memory.results import Match, TypeFields
 from tests.support.bags import Msg, battery, boolean, detections, text, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
@@ -45,10 +43,9 @@ class WatchedLake(Lake):
         self.read.update(file.location for file in files)
         return super().rows(name, files, *how)
 
-    def days_read(self) -> set[date]:
+    def days_read(self) -> set[str]:
         """The days of the files that were read since it was last asked."""
-        folders = (part for each in self.read for part in each.split("/"))
-        found = {date.fromisoformat(each[4:]) for each in folders if each.startswith("day=")}
+        found = {*re.findall("/day=([0-9-]+)/", str(self.read))}
         self.read.clear()
         return found
 
@@ -89,7 +86,7 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
     shipping.ship([old, old + 60, now])
     robot = shipping.robot()
     assert starts(robot) == [old, old + 60, now]
-    days = [day_of(at * NS_PER_S) for at in (old - DAY_S, old, old + DAY_S, now)]
+    days = [str(day_of(at * NS_PER_S)) for at in (old - DAY_S, old, old + DAY_S, now)]
     assert shipping.lake.days_read() == {days[1], days[3]}
     for new, looked_at in (
         ([], set()),
@@ -255,10 +252,6 @@ def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
         assert before <= always
 
 
-DAYS = 7
-"""Days ago that the first bag is of; from then on there are two of a day, and none of the third."""
-
-
 @pytest.fixture(scope="module")
 def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
@@ -266,14 +259,12 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     Its track is of another topic since.
     """
     folder = tmp_path_factory.mktemp("old")
-    labels = {DAYS: "mug", DAYS - 1: "fork"}
-    for ago in (7, 6, 4, 3, 1, 0):
+    for ago, seen in ((7, "mug"), (6, "fork"), *((ago, "cup") for ago in (4, 3, 1, 0))):
         at = (START_S - ago * DAY_S) * NS_PER_S
-        seen = labels.get(ago, "cup")
         messages: list[Msg] = [detections(at, [seen]), text(at + NS_PER_S, seen)]
-        if ago == DAYS:
+        if seen == "mug":
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
-        write_mcap(folder / "bags" / "rec" / f"rec_{DAYS - ago}.mcap", messages)
+        write_mcap(folder / "bags" / "rec" / f"rec_{7 - ago}.mcap", messages)
     ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
     return lake_robot(folder / "lake", days=1, most_bags=1)
 
@@ -312,35 +303,24 @@ def test_older_days_end_with_a_pause_and_begin_where_the_memory_does(robot: Robo
 
 
 def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) -> None:
-    spans: tuple[tuple[dict[str, Any], bool], ...] = (
-        ({}, True),
-        ({"start": START_S - DAY_S}, True),
-        ({"start": START_S}, False),
-        ({"last_s": 60}, False),
-        ({"end": START_S - 2 * DAY_S}, True),
-    )
-    for span, is_noted in spans:
+    of_the_newest: list[Any] = [{"start": START_S}, {"last_s": 60}]
+    before: list[Any] = [{}, {"start": START_S - DAY_S}, {"end": START_S - 2 * DAY_S}]
+    for span in of_the_newest + before:
         for name in ({}, {"robot": "hall"}):
             found = asked(robot, "find_matches", "cup", **span, **name)
-            assert ("not looked at" in str(found)) is is_noted, span
+            assert ("not looked at" in str(found)) is (span in before), span
 
 
 def test_where_the_time_is_short_it_says_how_far_it_looked(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.history.view.READING_S", 0.0)
-
-    def ask(topic: str, memory: Memory, call: Call) -> Match:
-        return find_last_match(memory, call, topic, "contains", "mug")
-
-    call = Call(Deadline.after(60))
-    found, lake = robot.ask(partial(ask, SEEN), call)
-    assert found.found is None
-    assert lake is not None
-    [note] = lake.notes
-    assert note.startswith("the lake has days before ")
-    with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
-        robot.ask(partial(ask, "/none"), Call(Deadline.after(60)))
+    mug, fleet = {"condition_type": "contains", "value": "mug"}, Fleet([robot], FixedClock(NOW))
+    for topic in (SEEN, "/none"):
+        given = {**mug, "topic": topic, "robot": "hall"}
+        found = reply(fleet, "find_last_match", given, Call(Deadline.after(60)))
+        assert found.get("value") is None
+        assert "the lake has days before " in str(found)
 
 
 LONG_AGO_S = START_S - 100 * DAY_S
@@ -376,22 +356,17 @@ def asked_alone(of: Robot, tool: str, **given: object) -> Any:
 
 
 @pytest.mark.parametrize("before", [{}, {"before": LONG_AGO_S + DAY_S}], ids=["ever", "before"])
-@pytest.mark.parametrize(("topic", "said"), [("/chatter", "ouch"), ("/map_name", "the map")])
-def test_a_value_is_of_the_days_of_the_match_or_before_them(
-    changed: Robot, topic: str, said: str, before: dict[str, Any]
+def test_a_value_is_of_the_days_of_the_match_or_before_them_and_of_no_day_is_not_recorded(
+    changed: Robot, before: dict[str, Any]
 ) -> None:
-    pressed = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
-    found = asked_alone(changed, "get_value_when", value_topic=topic, **pressed, **before)
-    assert found["timestamp"] == LONG_AGO_S + 60
-    assert found["value"]["value"] == said
-    assert "not looked at" not in str(found)
-
-
-def test_a_topic_that_no_day_has_is_not_recorded(changed: Robot) -> None:
-    pressed = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
-    found = asked_alone(changed, "get_value_when", value_topic="/none", **pressed)
-    assert found["reason"] == "topic_not_recorded"
-    assert "not looked at" not in str(found)
+    pressed = {"condition_topic": "/bumper", "condition_type": "equals", "value": True, **before}
+    for topic, said in (("/chatter", "ouch"), ("/map_name", "the map"), ("/none", None)):
+        found = asked_alone(changed, "get_value_when", value_topic=topic, **pressed)
+        if said is None:
+            assert found["reason"] == "topic_not_recorded"
+        else:
+            assert (found["timestamp"], found["value"]["value"]) == (LONG_AGO_S + 60, said)
+        assert "not looked at" not in str(found)
 
 
 def test_what_a_topic_is_follows_from_the_days_that_are_searched(changed: Robot) -> None:
@@ -405,12 +380,10 @@ def test_what_a_topic_is_follows_from_the_days_that_are_searched(changed: Robot)
 
 
 def test_a_type_of_days_before_is_described(changed: Robot) -> None:
-    def describe(type_name: str) -> TypeFields:
-        return describe_type(changed.memory, Call(), type_name)
-
-    assert describe("std_msgs/msg/String").topics == ("/chatter", "/dock")
+    found = describe_type(changed.memory, Call(), "std_msgs/msg/String")
+    assert found.topics == ("/chatter", "/dock")
     with pytest.raises(NoDataError, match=r"BatteryState, std_msgs/msg/Bool$"):
-        describe("std_msgs/msg/Int8")
+        describe_type(changed.memory, Call(), "std_msgs/msg/Int8")
 
 
 def test_each_of_two_windows_is_compared_by_its_own_days(changed: Robot) -> None:

@@ -52,7 +52,7 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(tmp_path: Path
         write_mcap(tmp_path / "bags" / name / f"{name}_0.mcap", messages)
         write_handover(tmp_path / "bags" / name, handover)
     bags, lake = (fleet_of({"hall": memory}) for memory in shipped(tmp_path))
-    asked: dict[str, object] = {"start": START_S, "end": START_S + 60}
+    asked = {"start": START_S, "end": START_S + 60}
     for tool in ("trajectory_summary", "find_things"):
         expected = reply(bags, tool, asked)
         assert "error" not in expected
@@ -69,7 +69,7 @@ def test_copies_among_images_are_told_by_their_publish_times(tmp_path: Path) -> 
             messages += [said, image]
         write_mcap(tmp_path / "bags" / f"r{recording}" / f"r{recording}_0.mcap", messages)
     bags, robot = shipped(tmp_path)
-    span: dict[str, object] = {"start": START_S - 1, "end": START_S + 99, "by": "day"}
+    span = {"start": START_S - 1, "end": START_S + 99, "by": "day"}
     for is_stored in (False, True):
         if is_stored:
             store_columns(robot)
@@ -88,7 +88,7 @@ def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
     bags, robot = shipped(tmp_path)
     filling = store_columns(robot)
     assert filling.store.paths() == ["rec/rec_0.mcap", "rec/rec_1.mcap"]
-    given: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
+    given = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
     over_lake, over_bags = fleet_of({"hall": robot}), fleet_of({"hall": bags})
     assert reply(over_lake, "find_matches", given) == reply(over_bags, "find_matches", given)
     first, second = robot.index.snapshot().bags

@@ -3,7 +3,6 @@
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,7 +63,9 @@ def values(folder: Path) -> list[str]:
     return sorted(dict(row["texts"])["value"] for row in lake_rows(folder, "messages"))
 
 
-EXPECTED = sorted(f"n{bag * 100 + nth}" for _ in ROBOTS for bag in range(BAGS) for nth in range(3))
+def written(bags: int, robots: int = 1) -> list[str]:
+    """The texts of so many bags of so many robots, sorted."""
+    return sorted([f"n{bag * 100 + nth}" for bag in range(bags) for nth in range(3)] * robots)
 
 
 def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
@@ -78,7 +79,7 @@ def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
         return scandir(folder)
 
     monkeypatch.setattr("ros2_memory.lake.shipper.os.scandir", hanging)
-    robots = [robot_bags(name, fleet / name) for name in ("hall", "kitchen")]
+    robots = [robot_bags(name, fleet / name) for name in ROBOTS]
     with shipping(tmp_path, robots) as shipper:
         shipper.patience_s = 3.0
         for bags in (BAGS, 0):
@@ -101,9 +102,7 @@ def test_what_it_stores_of_bags_is_in_a_file_and_cut_to_their_share(tmp_path: Pa
     for name, cache in (("memory", []), ("file", [tmp_path / "cache" / FILE])):
         robot = robot_bags("hall", tmp_path / "hall", FixedClock(LATER), cache=cache, limits=limits)
         assert ship(tmp_path / name, [robot], most_bags=100).bags == BAGS
-        assert values(tmp_path / name) == sorted(
-            f"n{bag}0{nth}" if bag else f"n{nth}" for bag in range(BAGS) for nth in range(3)
-        )
+        assert values(tmp_path / name) == written(BAGS)
         assert robot.filling is not None
         assert len(robot.filling.store.paths()) == (BAGS if cache else 0)
         assert bool(robot.filling.store.dropped()) == bool(cache)
@@ -152,7 +151,7 @@ def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
     (tmp_path / "hall" / ".episodic" / "shipped.jsonl").unlink()
     robots = [robot_bags("hall", tmp_path / "hall"), robot_bags("kitchen", fleet / "kitchen")]
     assert ship(tmp_path / "lake", robots).bags == BAGS
-    assert values(tmp_path / "lake") == EXPECTED
+    assert values(tmp_path / "lake") == written(BAGS, 2)
     # The copy gets receipts of its own.
     assert len(read_receipts(tmp_path / "hall")) == BAGS
 
@@ -178,7 +177,7 @@ def test_a_bag_that_retention_cut_keeps_its_rows(tmp_path: Path, first: int) -> 
     bag = write_bag(tmp_path / "hall", 0, at_s=START_S + first, most=1 + first)
     append_receipts(tmp_path / "hall", [replace(receipt, size=bag.stat().st_size)])
     assert ship_from(tmp_path).bags == 0
-    assert values(tmp_path / "lake") == ["n0", "n1", "n2"]
+    assert values(tmp_path / "lake") == written(1)
 
 
 @pytest.mark.parametrize("is_readable", [True, False])
@@ -302,25 +301,7 @@ def test_what_pyiceberg_refuses_is_committed_from_a_fresh_look(
         robot.look_again()
     assert ship(tmp_path, robots, most_bags=200).bags == 2 * BAGS
     assert len(refused) > 1
-    assert values(tmp_path) == EXPECTED
-
-
-def _points(monkeypatch: pytest.MonkeyPatch, reached: Callable[[], None]) -> None:
-    """Has a function called before every step that changes something, and after the last one."""
-
-    def stepped(real: Callable[..., object], *, is_last: bool) -> Callable[..., object]:
-        def step(*given: object, **named: object) -> object:
-            reached()
-            result = real(*given, **named)
-            if is_last:
-                reached()
-            return result
-
-        return step
-
-    commit, append = SqlCatalog.commit_table, append_receipts
-    monkeypatch.setattr(SqlCatalog, "commit_table", stepped(commit, is_last=False))
-    monkeypatch.setattr(shipper_module, "append_receipts", stepped(append, is_last=True))
+    assert values(tmp_path) == written(BAGS, 2)
 
 
 def test_killed_at_any_point_it_loses_and_doubles_nothing(
@@ -339,7 +320,19 @@ def test_killed_at_any_point_it_loses_and_doubles_nothing(
         if left == 0:
             raise _Killed
 
-    _points(monkeypatch, reached)
+    commit, append = SqlCatalog.commit_table, append_receipts
+
+    def commits(*given: Any) -> object:
+        reached()
+        return commit(*given)
+
+    def appends(*given: Any) -> None:
+        reached()
+        append(*given)
+        reached()
+
+    monkeypatch.setattr(SqlCatalog, "commit_table", commits)
+    monkeypatch.setattr(shipper_module, "append_receipts", appends)
     while left <= 0:
         write_bag(tmp_path / "hall", bags)
         bags += 1
@@ -352,11 +345,9 @@ def test_killed_at_any_point_it_loses_and_doubles_nothing(
     left = 0
     ship(tmp_path / "lake", robots)
     assert killed >= len(TABLES) + 2
-    texts = [f"n{bag * 100 + nth}" for bag in range(bags) for nth in range(3)]
-    assert values(tmp_path / "lake") == sorted(texts)
+    assert values(tmp_path / "lake") == written(bags)
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == bags
     assert lake_column(tmp_path / "lake", "sightings", "label") == ["cup"] * bags
-    assert len(read_receipts(tmp_path / "hall")) == bags
 
 
 def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path) -> None:

@@ -12,9 +12,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
-from pyiceberg.partitioning import PartitionSpec
-from pyiceberg.schema import Schema
-from pyiceberg.types import DateType, NestedField, StringType
 
 from ros2_memory.core.errors import LakeError, RefusedError
 from ros2_memory.core.timebase import NS_PER_S
@@ -56,12 +53,8 @@ def test_rows_are_sorted_and_lie_by_robot_and_day_in_zstd(catalog: SqlCatalog) -
 
 def test_an_older_lake_gets_the_columns_that_are_new(catalog: SqlCatalog) -> None:
     catalog.create_namespace_if_not_exists(NAMESPACE)
-    kinds = (StringType(), StringType(), DateType())
-    fields = [
-        NestedField(number, name, kind, required=True)
-        for number, (name, kind) in enumerate(zip(KEYS, kinds, strict=True), 1)
-    ]
-    catalog.create_table(f"{NAMESPACE}.things", Schema(*fields), partition_spec=PartitionSpec())
+    keys = pa.schema([(name, pa.string()) for name in KEYS])
+    catalog.create_table(f"{NAMESPACE}.things", keys)
     table = open_tables(catalog, ["things"])["things"]
     assert table.schema().column_names == [*TABLES["things"].columns]
 
@@ -89,8 +82,7 @@ def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
     tmp_path: Path,
 ) -> None:
     row = {**KEYS, "topic": "/seen", "first_ns": 0}
-    whole = TABLES["things"].to_arrow([{**row, "label": "cup", "spread_m": 0.1}])
-    path = tmp_path / "old.parquet"
+    whole, path = TABLES["things"].to_arrow([{**row, "label": "cup"}]), tmp_path / "old.parquet"
     pq.write_table(whole.drop_columns(["spread_m"]), path)
     lake, files = Lake(lake_in(tmp_path)), [LakeFile(path.as_uri())]
     columns = ("label", "spread_m")
@@ -206,37 +198,35 @@ def hub(folder: Path, name: str) -> LakeLocation:
     return LakeLocation((folder / "lake").as_uri(), state_dir)
 
 
-def owner_file(folder: Path) -> Path:
-    return folder / "lake" / "ros2_memory" / "writer.json"
+@pytest.fixture
+def owner_file(tmp_path: Path) -> Path:
+    return tmp_path / "lake" / "ros2_memory" / "writer.json"
 
 
 def test_the_first_hub_keeps_the_lake_and_another_is_refused_until_it_is_given_up(
-    tmp_path: Path,
+    tmp_path: Path, owner_file: Path
 ) -> None:
-    hub(tmp_path, "one").claim()
-    for _ in range(2):
-        with pytest.raises(
-            LakeError, match=rf"another writer, with lake\.state_dir={tmp_path}/one"
-        ):
+    for _ in range(3):  # also after it was killed
+        hub(tmp_path, "one").claim()
+        with pytest.raises(LakeError, match=f"another writer, with lake.state_dir={tmp_path}/one"):
             hub(tmp_path, "other").claim()
-        hub(tmp_path, "one").claim()  # also after it was killed
     # The file of an older version keeps others out, too.
-    own = json.loads(owner_file(tmp_path).read_text())
-    owner_file(tmp_path).write_text(json.dumps({"id": own["id"], "pid": 1, "until": 0}))
+    own = json.loads(owner_file.read_text())
+    owner_file.write_text(json.dumps({"id": own["id"], "pid": 1, "until": 0}))
     hub(tmp_path, "one").claim()
     with pytest.raises(LakeError, match="another writer"):
         hub(tmp_path, "other").claim()
-    owner_file(tmp_path).unlink()
+    owner_file.unlink()
     hub(tmp_path, "other").claim()
     # What the first would commit now is refused.
     with pytest.raises(LakeError, match="another writer"):
         hub(tmp_path, "one").claim()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", json.dumps({"id": 5})])
-def test_a_damaged_file_keeps_nobody_out(tmp_path: Path, text: str) -> None:
-    owner_file(tmp_path).parent.mkdir(parents=True)
-    owner_file(tmp_path).write_text(text)
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"id": 5}'])
+def test_a_damaged_file_keeps_nobody_out(tmp_path: Path, owner_file: Path, text: str) -> None:
+    owner_file.parent.mkdir(parents=True)
+    owner_file.write_text(text)
     hub(tmp_path, "one").claim()
     with pytest.raises(LakeError, match="another writer"):
         hub(tmp_path, "other").claim()

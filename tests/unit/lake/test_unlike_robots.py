@@ -172,7 +172,7 @@ def test_every_question_is_answered_by_two_shares_as_by_the_whole_or_refused(
 
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
-    asked: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
+    asked = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
     robots = [replace(robot, in_lake=True) for robot in world.lake.robots.values()]
     *_, note = reply(Fleet(robots, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
@@ -190,7 +190,7 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
 
 def answers_of_the_page(folder: Path) -> list[list[tuple[Any, ...]]]:
     """What the statements of the page about the lake find in the lake of a folder."""
-    page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "how-to" / "lake.md").read_text()
     lake = Lake(lake_in(folder))
     found = map(lake.query, re.findall(r"```sql\n(.*?);\n```", page, re.DOTALL))
     return [[tuple(row) for row in selected.rows] for selected in found]
@@ -220,7 +220,7 @@ def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: Worl
     percentages = [1 - step / 1000 for step in range(0, 5 * LENGTH_S, 25)]
     of_lost = [row[2:] for row in charge if row[0] == "lost"]
     assert of_lost == [pytest.approx((min(percentages), max(percentages)))]
-    mug: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "mug"}
+    mug = {"topic": "/vision/*/*", "condition_type": "contains", "value": "mug"}
     matches = reply(world.mounted, "find_last_match", mug)["matches"]
     assert [(row[0], round(row[1], 3)) for row in last] == [
         (row["robot_name"], row["timestamp"]) for row in matches

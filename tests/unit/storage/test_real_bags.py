@@ -9,7 +9,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
@@ -24,10 +24,10 @@ from tests.support.shared_bags import REAL, needs_real
 
 pytestmark = needs_real
 
-FIRST: Final = "rosbag2_v1_2018_db3"
-CONFORMANCE: Final = "mcap_conformance_2022"
-DAMAGED: Final = {"tiryoh_small_and_truncated": {"Dockerfile.mcap"}}
-REFUSED: Final = {
+FIRST = "rosbag2_v1_2018_db3"
+CONFORMANCE = "mcap_conformance_2022"
+DAMAGED = {"tiryoh_small_and_truncated": {"Dockerfile.mcap"}}
+REFUSED = {
     FIRST: {
         "test_msgs/msg/StaticArrayPrimitives": "no definition",
         "test_msgs/msg/Primitives": "no definition",
@@ -51,7 +51,7 @@ REFUSED: Final = {
 def expected() -> dict[str, Any]:
     if not REAL.is_dir():
         return {}
-    text = (REAL / "expected.json").read_text(encoding="utf-8")
+    text = (REAL / "expected.json").read_text()
     return {name: entry["expected"] for name, entry in json.loads(text).items()}
 
 
@@ -60,7 +60,7 @@ def memory(name: str) -> Memory:
     return memory_of(REAL / name, storage="rosbag2")
 
 
-READER: Final = Rosbag2Reader()
+READER = Rosbag2Reader()
 
 
 def files_of(name: str) -> list[Path]:
@@ -120,11 +120,11 @@ def test_every_legal_layout_of_the_summary_section_is_read() -> None:
     assert found == {}
 
 
-NOISY: Final = ("cougars_auv_mcap", "/coug2/depth_data")
+NOISY = ("cougars_auv_mcap", "/coug2/depth_data")
 """What carries noise, and more than a handful of poses: a pressure sensor that sinks."""
-ROUNDED: Final = 5e-5
+ROUNDED = 5e-5
 """What it makes of a path's length that positions are those of the store, in steps of 0.1 mm."""
-ROUNDED_NOISE: Final = 1.5e-3
+ROUNDED_NOISE = 1.5e-3
 """Of the plain sum of steps that are not much longer than that."""
 
 

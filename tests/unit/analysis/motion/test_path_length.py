@@ -45,7 +45,7 @@ def driven(positions: Iterable[Vector3 | list[float]], hertz: float = 1.0) -> Po
     return posed((BEGIN + round(nth * S / hertz), place) for nth, place in enumerate(positions))
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(
     st.sampled_from([20, 50]),
     st.floats(0.1, 2.0),
@@ -86,9 +86,6 @@ def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
     assert len(found.totals.resets) == 1
 
 
-# Of these none is at the origin, where odometry may have begun anew.
-
-
 def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
     """Distance from the polyline, written independently of the code under test."""
     vertices = np.array([waypoint.position for waypoint in found.waypoints])
@@ -119,11 +116,9 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     assert (times[0], times[-1]) == (poses.times[0], poses.times[-1])
 
 
-elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
-
-
-@given(st.lists(elsewhere, min_size=2, max_size=15))
+@given(st.lists(points.map(lambda at: (abs(at[0]) + 10, *at[1:])), min_size=2, max_size=15))
 def test_of_few_poses_the_distance_is_the_plain_length(positions: list[Vector3]) -> None:
+    """None is at the origin, where odometry may have begun anew."""
     found = way_of(driven(positions), 1e9).trajectory()
     length_m = math.fsum(math.dist(a, b) for a, b in pairwise(positions))
     assert found.totals.distance_m == pytest.approx(length_m, rel=1e-12)

@@ -3,11 +3,13 @@
 import math
 from itertools import pairwise
 from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
@@ -28,12 +30,11 @@ S = 10**9
 START = 1_700_000_000 * S
 
 
-def driven(seed: int) -> tuple[list[int], list[float], list[float], list[float]]:
-    """Drives on, turns on the spot and stands, at 25 Hz."""
+def driven(seed: int) -> list[NDArray[Any]]:
+    """Times, x, y and headings of who drives on, turns on the spot and stands, at 25 Hz."""
     draw = Random(seed)
     at, x, y, heading = START, 0.0, 0.0, 0.0
-    times: list[int] = []
-    poses: list[tuple[float, float, float]] = []
+    poses = []
     speed, rate = 0.0, 0.0
     for _ in range(1500):
         if draw.random() < 0.02:
@@ -42,30 +43,22 @@ def driven(seed: int) -> tuple[list[int], list[float], list[float], list[float]]
         heading += rate * 0.04
         x += speed * 0.04 * math.cos(heading)
         y += speed * 0.04 * math.sin(heading)
-        times.append(at)
-        poses.append((x, y, math.remainder(heading, math.tau)))
-    xs, ys, headings = ([*column] for column in zip(*poses, strict=True))
-    return times, xs, ys, headings
-
-
-def of(rows: tuple[list[int], list[float], list[float], list[float]]) -> RobotTrack:
-    times, x, y, heading = rows
-    return track_of(np.array(times, np.int64), np.array(x), np.array(y), np.array(heading))
+        poses.append((at, x, y, math.remainder(heading, math.tau)))
+    return [*map(np.array, zip(*poses, strict=True))]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_every_pose_is_near_the_track_at_its_time(seed: int) -> None:
-    rows = driven(seed)
-    track = of(rows)
-    times = np.array(rows[0])
-    x, y, heading = (
+    times, x, y, heading = driven(seed)
+    track = track_of(times, x, y, heading)
+    track_x, track_y, track_heading = (
         np.interp(times - START, track.times - START, column)
         for column in (track.x, track.y, track.heading)
     )
-    assert np.hypot(x - np.array(rows[1]), y - np.array(rows[2])).max() <= TOLERANCE_M + 0.01
-    off = np.remainder(heading - np.array(rows[3]) + math.pi, math.tau) - math.pi
+    assert np.hypot(track_x - x, track_y - y).max() <= TOLERANCE_M + 0.01
+    off = np.remainder(track_heading - heading + math.pi, math.tau) - math.pi
     assert np.abs(off).max() <= TOLERANCE_RAD + 0.05
-    assert {*track.times.tolist()} <= {*rows[0]}
+    assert {*track.times.tolist()} <= {*times.tolist()}
     assert len(track.times) < len(times) / 3
 
 
@@ -76,22 +69,21 @@ def same(one: RobotTrack, other: RobotTrack) -> bool:
     )
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(
     seed=st.integers(0, 999), cuts=st.lists(st.integers(1, 1499), max_size=6), thins=st.booleans()
 )
 def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     seed: int, cuts: list[int], thins: bool
 ) -> None:
-    columns = [np.array(column) for column in driven(seed)]
+    columns = driven(seed)
 
     def part(begin: int, end: int) -> PartialTrack:
         some = [column[begin:end] for column in columns]
         if thins:
             index = slot_ends(some[0])
             some = [column[index] for column in some]
-        times, x, y, heading = some
-        return partial_track(times, x, y, heading)
+        return partial_track(*some)
 
     whole = track_by(*joined_tracks([[part(0, 1500)]]))
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]

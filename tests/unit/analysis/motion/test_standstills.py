@@ -2,19 +2,15 @@
 
 import math
 import random
-from itertools import count, pairwise
+from itertools import chain, count, pairwise
 from typing import NamedTuple
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.standstills import (
-    DROP_SLOT_NS,
-    SpeedDrop,
-    Standstill,
-    speed_drops,
-)
+from ros2_memory.analysis.motion.standstills import DROP_SLOT_NS, SpeedDrop, speed_drops
+from ros2_memory.analysis.poses import Poses as PoseArrays
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import LONG
 from tests.unit.analysis.motion.posed import posed, stood_in
@@ -51,25 +47,19 @@ def world(
         while leg + 1 < len(legs) and time >= edges[leg + 1]:
             leg += 1
         x = places[leg] + (time - edges[leg]) * legs[leg][1]
-        place = (x, 2.0, 0.0)
-        if noise:
-            place = (x + draw.gauss(0, noise), 2.0 + draw.gauss(0, noise), draw.gauss(0, noise))
-        poses.append((round(time * S), place))
+        dx, dy, dz = (draw.gauss(0, noise) for _ in range(3))
+        poses.append((round(time * S), (x + dx, 2.0 + dy, dz)))
     standing = [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
     return World(poses, standing, 1 / hz)
 
 
-def standstills_of(poses: Poses, blocks: int = 10**6) -> tuple[Standstill, ...]:
-    """The standstills, found in slices of so many blocks of the clock; mostly in one."""
-    return stood_in(posed(poses), blocks=blocks)[0]
+def standstills_of(poses: Poses, blocks: int = 10**6) -> list[tuple[float, float]]:
+    """The standstills (s), found in slices of so many blocks of the clock; mostly in one."""
+    return [(each.start / S, each.end / S) for each in stood_in(posed(poses), blocks=blocks)[0]]
 
 
-def spans(standstills: tuple[Standstill, ...]) -> list[tuple[float, float]]:
-    return [(each.start / S, each.end / S) for each in standstills]
-
-
-def stood(standstills: tuple[Standstill, ...]) -> float:
-    return sum(end - start for start, end in spans(standstills))
+def stood(standstills: list[tuple[float, float]]) -> float:
+    return sum(end - start for start, end in standstills)
 
 
 LEGS = st.lists(
@@ -98,11 +88,11 @@ def worlds(draw: st.DrawFn, noise: float = 0.0) -> World:
     )
 
 
-@settings(max_examples=150 if LONG else 15, deadline=None)
+@settings(max_examples=150 if LONG else 15)
 @given(worlds())
 def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     period = made.period + 1e-6
-    found = spans(standstills_of(made.poses))
+    found = standstills_of(made.poses)
     for start, end in found:
         began, ended = min(made.standing, key=lambda span: abs(span[0] - start))
         assert abs(start - began) <= period
@@ -118,13 +108,13 @@ def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: floa
     made = world([(20.0, 0.0), (60.0, speed), (20.0, 0.0)], hz=20, noise=noise)
     found = standstills_of(made.poses)
     assert stood(found) == pytest.approx(40, abs=14)
-    assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
+    assert all(end <= 127 or start >= 173 for start, end in found)
 
 
 def test_a_standstill_that_drifts_away_ends_where_the_next_one_begins() -> None:
     found = standstills_of(world([(2400.0, 0.002)], hz=5).poses)
     assert len(found) > 4
-    assert all(one.end == other.start for one, other in pairwise(found))
+    assert all(end == start for (_, end), (start, _) in pairwise(found))
     assert stood(found) == pytest.approx(2400, abs=1)
 
 
@@ -134,22 +124,16 @@ def restless(draw: st.DrawFn) -> Poses:
     rate = draw(st.sampled_from([1, 2, 4, 5, 10, 20, 50]))
     noise = draw(st.sampled_from([0.0, 0.003, 0.01, 0.015, 0.02, 0.03, 0.2]))
     toggle = draw(st.sampled_from([0.0, 0.01, 0.03, 0.05]))
-    random_draw = random.Random(draw(st.integers(0, 10_000)))
+    chance = random.Random(draw(st.integers(0, 10_000)))
     begin = draw(st.integers(100 * S, 101 * S))
-    return [
-        (
-            begin + nth * S // rate,
-            (
-                random_draw.gauss(0, noise) + random_draw.choice([0.0, toggle]),
-                random_draw.gauss(0, noise),
-                0.0,
-            ),
-        )
-        for nth in range(min(60 * rate, 1500))
-    ]
+    poses: Poses = []
+    for nth in range(min(60 * rate, 1500)):
+        x = chance.gauss(0, noise) + chance.choice([0.0, toggle])
+        poses.append((begin + nth * S // rate, (x, chance.gauss(0, noise), 0.0)))
+    return poses
 
 
-@settings(max_examples=150 if LONG else 15, deadline=None)
+@settings(max_examples=150 if LONG else 15)
 @given(
     st.one_of(restless(), *(worlds(noise=each).map(lambda made: made.poses) for each in (0, 0.01))),
     st.integers(1, 40),
@@ -158,8 +142,9 @@ def test_standstills_under_any_noise_are_in_order_and_the_same_in_slices_of_any_
     poses: Poses, blocks: int
 ) -> None:
     found = standstills_of(poses)
-    assert all(poses[0][0] <= each.start < each.end <= poses[-1][0] for each in found)
-    assert all(one.end <= other.start for one, other in pairwise(found))
+    assert all(start < end for start, end in found)
+    edges = [poses[0][0] / S, *chain.from_iterable(found), poses[-1][0] / S]
+    assert edges == sorted(edges)
     assert standstills_of(poses, blocks) == found
 
 
@@ -187,8 +172,11 @@ def driven(*legs: tuple[float, float, float], rate: int = 20) -> list[Pose]:
 
 
 def found(poses: list[Pose]) -> list[SpeedDrop]:
-    rows = [(at, place) for at, place, _ in poses]
-    return [*speed_drops(posed(rows, [turn for *_, turn in poses]))]
+    return [*speed_drops(turned(poses))]
+
+
+def turned(poses: list[Pose]) -> PoseArrays:
+    return posed(((at, place) for at, place, _ in poses), [turn for *_, turn in poses])
 
 
 @pytest.mark.parametrize(
@@ -233,6 +221,4 @@ def test_slices_of_any_length_change_no_drop(
     poses = driven(*legs, rate=10)
     if silent:
         poses = [each for each in poses if (each[0] - BEGIN) // DROP_SLOT_NS % 17 > 1]
-    rows = [(at, place) for at, place, _ in poses]
-    turned = posed(rows, [turn for *_, turn in poses])
-    assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]
+    assert stood_in(turned(poses), blocks=blocks)[1] == found(poses)
