@@ -277,7 +277,6 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
     ("override", "fragments"),
     [
         ("datas.now=wall", ["datas: unknown key", "recording, data, reader"]),
-        ("data.nwo=wall", ["data.nwo: unknown key", "now, tf_clock"]),
         ("storage.cache=1", ["storage.cache: storage=mcap has no such", "rosbag2"]),
         ("lake.engine.memory_mb=512", ["lake.engine: ", "choose that", "on the command line"]),
         ("~data.now", ["data.now: missing"]),
@@ -290,7 +289,6 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
         ("recording.bag_dir='~nobody-here/x'", ["recording.bag_dir", "can be found"]),
         ("data.time_tolerance_s=true", ["data.time_tolerance_s: True", "valid number"]),
         ("data.max_plausible_speed_mps=nan", ["nan", "finite"]),
-        ("data.pose_topic=''", ["data.pose_topic: ''", "must not be empty"]),
         ("data.tf_topics=/tf", ["data.tf_topics: '/tf'", "must be a list"]),
         ("retention.max_total_gb='2GB'", ["'2GB'", "must be a number in GB, such as 2"]),
         ("recorder.setup_files=[/a", ["is not a setting", "where spaces"]),
@@ -298,7 +296,6 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
         ("data.now=${nothing}", ["data.now: ", "'nothing' not found"]),
         ("server.host=${oc.env:NO_SUCH_VARIABLE}", ["server.host: ", "NO_SUCH_VARIABLE"]),
         ("storage=parquet", ["storage: 'parquet'", "mcap, rosbag2"]),
-        ("storage=[mcap,rosbag2]", ["storage: ['mcap', 'rosbag2']", "mcap, rosbag2"]),
         ("server.port", ["'server.port' is not a setting", "key=value"]),
         ("/bags/monday", ["is not a setting", "key=value"]),
         ("=3", ["'=3' is not one value for one key"]),

@@ -56,18 +56,21 @@ def vehicle(ns: int, x: float, topic: str = VEHICLE) -> Msg:
     return Msg(topic, "px4_msgs/msg/VehicleOdometry", ns, body)
 
 
-def fix(ns: int, north: float, east: float, status: int = 0) -> Msg:
+def fix(ns: int, north: float, status: int = 0) -> Msg:
     body = make(
         "sensor_msgs/msg/NavSatFix",
         header=header(ns, "gps"),
         status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
         latitude=48.1234567 + north,
-        longitude=11.7654321 + east,
+        longitude=11.7654321,
         altitude=519.5,
         position_covariance=np.zeros(9),
         position_covariance_type=0,
     )
     return Msg("/fix", "sensor_msgs/msg/NavSatFix", ns, body)
+
+
+FIXES = [fix(T0 + n * S, n * 1e-5) for n in range(60)]
 
 
 @lru_cache(maxsize=2)
@@ -89,9 +92,18 @@ def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
     assert "carries no position" in refused["detail"]
 
 
-def test_numbers_without_a_fix_are_told_where_they_count(tmp_path: Path) -> None:
-    states = [fix(T0 + n * S, 0.0, 0.0, -1 if n == 4 else 0) for n in range(9)]
+def test_a_position_without_a_fix_says_so_and_is_in_no_map_and_its_numbers_are_told(
+    tmp_path: Path,
+) -> None:
+    states = [fix(T0 + n * S, n * 1e-5, -1 if n == 4 else 0) for n in range(9)]
     write_mcap(tmp_path / "bag.mcap", states)
+    for at, has_fix in ((4, False), (5, True)):
+        found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + at, topic="/fix")
+        assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
+        assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
+    view = View(remembered(tmp_path, False), Call())
+    fixes = fixes_in(view, "/fix", TimeWindow.everything())
+    assert [at for at, _ in fixes] == [T0 + n * S for n in range(9) if n != 4]
     height = {"topic": "/fix", "fields": ["altitude"], "start": T0_S}
     for given in ({}, {"by": "hour"}):
         reply = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 8, **height, **given)
@@ -136,18 +148,6 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     assert ask(tmp_path, False, "find_matches", **above)["notes"].count(note) == 1
 
 
-def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> None:
-    states = [fix(T0 + n * S, n * 1e-5, 0.0, -1 if n < 5 else 0) for n in range(9)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", states)
-    memory = memory_of(tmp_path)
-    for at, has_fix in ((4, False), (5, True)):
-        found = asked(memory, "get_position_at", timestamp=T0 / S + at, topic="/fix")
-        assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
-        assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
-    fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
-    assert [at for at, _ in fixes] == [T0 + n * S for n in range(5, 9)]
-
-
 @each_way
 @pytest.mark.parametrize(
     ("tool", "given"),
@@ -161,7 +161,7 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> No
 def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", FIXES[:9])
     reply = ask(tmp_path, recalls, tool, **given)
     detail = reply["notes"][0] if tool == "recap" else reply["detail"]
     assert "data.pose_topic=/fix" not in detail
@@ -181,9 +181,6 @@ def moved(tenths: range) -> list[Msg]:
         )
         for n in tenths
     ]
-
-
-FIXES = [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(60)]
 
 
 @each_way
@@ -225,21 +222,6 @@ def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     assert "not of two/base_link, as of other robots" in notes
 
 
-def test_a_position_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:
-    messages = [tf(T0, transform(T0, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static")]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, odom(T0 + S, 1.0, 0.0, 0.0)])
-    places = (
-        Place("pen", "odom", Circle(0.0, 0.0, 3.0)),
-        Place("dock", "map", Circle(11.0, 0.0, 0.5)),
-        Place("yard", "map", Circle(11.0, 0.0, 9.0)),
-        Place("hall", "map", Circle(1.0, 0.0, 0.5)),
-        Place("lab", "site", Circle(1.0, 0.0, 0.5)),
-    )
-    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
-    reply = asked(memory, "get_position_at", timestamp=T0_S + 1)
-    assert (reply["in"], reply["also_in"]) == ("dock", ["pen", "yard"])
-
-
 def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:
     placed = [tf(T0, transform(T0, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static")]
     messages = [*placed, detections(T0 + 30 * S, ["cup"], at=(0.1, 0.0, 0.0))]
@@ -248,29 +230,32 @@ def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_pat
         body = transform(at, "odom", "base_link", (3.0, 0.0, 0.0))
         messages += [odom(at, 3.0, 0.0), tf(at, body), boolean(at, n == 30)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    places = (Place("pen", "odom", Circle(3.0, 0.0, 1.0)), Place("yard", "map", Circle(13, 0, 9)))
+    places = (
+        Place("pen", "odom", Circle(3.0, 0.0, 1.0)),
+        Place("dock", "map", Circle(13.0, 0.0, 0.5)),
+        Place("yard", "map", Circle(13.0, 0.0, 9.0)),
+        Place("hall", "map", Circle(3.0, 0.0, 0.5)),
+        Place("lab", "site", Circle(3.0, 0.0, 0.5)),
+    )
     memory = memory_of(tmp_path, limits=QuerySettings(places=places))
+    there = asked(memory, "get_position_at", timestamp=T0_S + 1)
     events = asked(memory, "recap", start=T0_S, end=T0_S + 59)["events"]
     assert len(events) >= 3
     seen = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
     [cup] = asked(memory, "find_matches", **seen)["sightings"]
-    for at in (*(event for event in events if "in" in event), cup["place"]):
-        assert (at["in"], at["also_in"]) == ("pen", ["yard"])
-
-
-def in_the_map_at_first(bag_dir: Path) -> Memory:
-    """A robot that drives for a minute, of which transforms lead to the map for 20 s."""
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
-    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
-    messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
-    write_mcap(bag_dir / "r" / "r_0.mcap", messages)
-    return memory_of(bag_dir)
+    for at in (there, *(event for event in events if "in" in event), cup["place"]):
+        assert (at["in"], at["also_in"]) == ("dock", ["pen", "yard"])
 
 
 def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_is_known(
     tmp_path: Path,
 ) -> None:
-    memory = in_the_map_at_first(tmp_path)
+    """What was found stays, where the robot was is left out."""
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
+    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
+    messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
+    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
+    memory = memory_of(tmp_path)
     later = {"start": T0_S + 40, "end": T0_S + 59}
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 50}),
@@ -284,12 +269,6 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
         assert answer["error"] == "invalid_arguments"
     both = asked(memory, "get_position_at", timestamps=[T0_S + 10, T0_S + 50], frame_id="map")
     assert [each.get("x", each.get("error")) for each in both["results"]] == [6.0, "no_data"]
-
-
-def test_a_match_stays_where_the_robot_is_not_known_in_the_frame_that_was_asked_for(
-    tmp_path: Path,
-) -> None:
-    memory = in_the_map_at_first(tmp_path)
     said = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
     answer = asked(memory, "find_matches", frame_id="map", **said)
     newest, oldest = answer["sightings"]

@@ -361,27 +361,24 @@ def _part_of(text: str, random: Random) -> str:
     return text[begin : begin + random.randint(1, 8)] or "x"
 
 
-def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
+def _test(leaf: Any, random: Random) -> Contains | Equals | Beyond:
     if leaf is None or (isinstance(leaf, float) and math.isnan(leaf)):
         leaf = 0
-    needle: bool | float | str = 0
     if isinstance(leaf, str):
         part = _part_of(leaf, random)
-        needle = random.choice([leaf, leaf.upper(), part, f"{part}q"])
+        needles = [leaf, leaf.upper(), part, f"{part}q"]
     elif isinstance(leaf, bool):
-        alike: list[bool | str | int] = [leaf, str(leaf), int(leaf)]
-        needle = random.choice(alike)
-    elif isinstance(leaf, int | float):
-        near: list[float | str] = [leaf, leaf + 1, leaf * (1 + 1e-12), leaf / 2, str(leaf)]
-        needle = random.choice([leaf, float(leaf), *near, 10**400])
+        needles = [leaf, str(leaf), int(leaf)]
+    else:
+        near = [leaf, leaf + 1, leaf * (1 + 1e-12), leaf / 2, str(leaf)]
+        needles = [leaf, float(leaf), *near, 10**400]
+    needle = random.choice(needles)
     kind = random.choice(["contains", "equals", "above", "below"])
     if kind in {"above", "below"}:
-        is_number = isinstance(needle, int | float) and not isinstance(needle, bool)
-        return Beyond(needle if is_number else 0.5, kind == "above")  # type: ignore[arg-type]
-    if kind == "contains":
-        held = needle if not isinstance(needle, str) or needle.strip() else "cup"
-        if not isinstance(held, str) or random.random() < 0.5:
-            return Contains(held)
-        other = random.choice(["cup", "x", _part_of(str(leaf), random)])
-        return Contains(random.choice([held, held, f"{held} -{other}"]), whole=True)
-    return Equals(needle)
+        return Beyond(0.5 if isinstance(needle, str | bool) else needle, kind == "above")
+    if kind == "equals":
+        return Equals(needle)
+    if not isinstance(needle, str) or random.random() < 0.5:
+        return Contains(needle if str(needle).strip() else "cup")
+    held, other = needle.strip() or "cup", random.choice(["cup", "x", _part_of(str(leaf), random)])
+    return Contains(random.choice([held, held, f"{held} -{other}"]), whole=True)

@@ -122,18 +122,27 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
     assert check_all(world) == 901
 
 
-@pytest.fixture
-def long_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a bag that is decoded in several goes, as those of many gigabytes are."""
-    monkeypatch.setattr(decode, "GROUP_BYTES", 1)
-    monkeypatch.setattr(bulk, "BATCH_BYTES", 4000)
+def decode_in_groups(patch: pytest.MonkeyPatch) -> None:
+    """Has bags decoded in several goes, as those of many gigabytes are."""
+    patch.setattr(decode, "GROUP_BYTES", 1)
+    patch.setattr(bulk, "BATCH_BYTES", 4000)
+
+
+def write_long_bag(bag_dir: Path) -> None:
     messages = [
         message
         for at in range(T0, T0 + 3600 * S, 60 * S)
         for message in (odom(at, at / S, 0.0), text(at + 5, f"word {at}"))
     ]
-    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
+    path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
     os.utime(path, ns=(T0, T0))
+
+
+@pytest.fixture
+def long_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a long bag."""
+    decode_in_groups(monkeypatch)
+    write_long_bag(tmp_path)
     return tmp_path
 
 

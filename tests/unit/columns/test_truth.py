@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from random import Random
 
 import numpy as np
@@ -197,9 +198,9 @@ def test_poses_of_columns_are_those_of_drawn_messages(drawn: Drawn) -> None:
         twist = EXTRACTOR.twist(message_, drawn.type)
         turn = (math.nan,) * 4 if pose.orientation is None else pose.orientation
         speed = math.nan if twist is None else math.hypot(*twist.linear)
-        numbers_found = [*found.positions[row], *found.turns[row], found.speeds[row]]
-        near = pytest.approx([*pose.position, *turn, speed], rel=2e-7, abs=2e-7, nan_ok=True)
-        assert numbers_found == near
+        near = partial(pytest.approx, rel=1e-12, nan_ok=True)
+        assert found.positions[row].tolist() == near(pose.position, abs=0.51e-4)
+        assert [*found.turns[row], found.speeds[row]] == near([*turn, speed], abs=1.02e-4)
         assert found.frames.words[found.frames.codes[row]] == pose.frame_id
 
 

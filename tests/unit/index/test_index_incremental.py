@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.index import timeline
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.scan import ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
@@ -162,12 +161,7 @@ class World:
 def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
     script: list[tuple[str, str, int]],
 ) -> None:
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        ExitStack() as held,
-        pytest.MonkeyPatch.context() as patch,
-    ):
-        patch.setattr(timeline, "SEGMENT_BAGS", 4)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as held:
         world = World(Path(folder), held)
         for deed in script:
             world.do(*deed)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
@@ -178,34 +178,24 @@ def test_a_lake_without_a_bag_shows_none_that_it_had(shipping: Shipping, tmp_pat
     assert [*shipping.lake.days("bags")] == []
 
 
-def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
+def test_bags_of_one_name_have_paths_of_their_own_and_are_all_searched(shipping: Shipping) -> None:
     """As of a robot that was set up again: its recordings may have names of before.
 
     A question that is under way reads the bag that it found.
     """
-    robot = shipping.robot()
-    shipping.ship([START_S - 2 * DAY_S], name="rec_0")
-    shipping.ship([START_S], name="rec_0")
-    before = robot.index.refresh().bags
-    assert len({bag.file for bag in before}) == 2
-    shipping.ship([START_S - DAY_S], name="rec_0")
-    bags = robot.index.refresh().bags
-    assert len({bag.file for bag in bags}) == 3
-    assert [bags[0], bags[2]] == [*before]
-    for bag in bags:
-        [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
-        assert record.log_time == bag.start
-
-
-def test_a_bag_of_older_days_that_shares_a_name_with_a_newer_one_is_searched(
-    shipping: Shipping,
-) -> None:
-    for ago, label in ((4, "mug"), (2, "fork"), (0, "cup")):
+    robot, found = shipping.robot(), list[BagFile]()
+    of_days = Robot("hall", Path("/hall"), shipping.robot(days=1, most_bags=1), in_lake=True)
+    for ago, label in ((4, "mug"), (0, "cup"), (2, "fork")):
         shipping.ship([START_S - ago * DAY_S], label, name="rec_0")
-    robot = Robot("hall", Path("/hall"), shipping.robot(days=1, most_bags=1), in_lake=True)
-    for label, ago in (("cup", 0), ("fork", 2), ("mug", 4)):
-        found = asked(robot, "find_last_match", label)
-        assert [row["timestamp"] for row in found["matches"]] == [START_S - ago * DAY_S]
+        bags = robot.index.refresh().bags
+        assert {*found} < {*bags}
+        found = [*bags]
+    assert len({bag.file for bag in found}) == 3
+    for bag, (label, ago) in zip(found, (("mug", 4), ("fork", 2), ("cup", 0)), strict=True):
+        [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
+        match = asked(of_days, "find_last_match", label)["matches"]
+        assert [row["timestamp"] for row in match] == [START_S - ago * DAY_S]
+        assert record.log_time == bag.start == (START_S - ago * DAY_S) * NS_PER_S
 
 
 def test_after_a_clock_was_set_back_what_is_shipped_is_found(shipping: Shipping) -> None:

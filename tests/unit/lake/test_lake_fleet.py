@@ -25,6 +25,7 @@ from tests.support.bags import text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import ship_from, write_bag
 
+CHATTER = {"robot": "hall", "topic": "/chatter", "seconds": 1e9}
 CUP = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
 
 
@@ -138,9 +139,7 @@ def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_o
     ship_from(tmp_path)
     write_bag(tmp_path / "hall", 0, at_s=START_S + 1, most=2)
     fleet = served(tmp_path)
-    found = reply(
-        fleet, "get_topic_in_last", {"robot": "hall", "topic": "/chatter", "seconds": 1e9}
-    )
+    found = reply(fleet, "get_topic_in_last", CHATTER)
     assert [sample["value"]["value"] for sample in found["samples"]] == ["n0", "n1", "n2"]
     assert "could not be read" not in str(found)
     assert reply(fleet, "find_last_match", CUP | {"value": "tree"})["never"] == ["hall"]
@@ -157,17 +156,13 @@ def test_what_stayed_of_a_day_counts_only_where_a_bag_of_it_was_not_shipped(
     ship_from(tmp_path)
     for bag in bags:
         bag.unlink(missing_ok=True)
-    ends = [(START_S + 10 * nth) * NS_PER_S for nth in range(4)]
-    named = [(f"rec_{nth}", ends[nth], ends[nth + 1] - NS_PER_S) for nth in range(3)]
+    starts = [(START_S + 10 * nth) * NS_PER_S for nth in range(3)]
+    named = [(f"rec_{nth}", start, start + 9 * NS_PER_S) for nth, start in enumerate(starts)]
     append_deleted(tmp_path / "hall", [deleted_of("rec", named)])
     first = 0 if has_first else 3
     stayed = [text((START_S + nth) * NS_PER_S, "n") for nth in range(first, 30, 3)]
     write_mcap(tmp_path / "hall" / MEMORY_FOLDER / memory_file("20261120"), stayed)
-    found = reply(
-        served(tmp_path),
-        "get_topic_in_last",
-        {"robot": "hall", "topic": "/chatter", "seconds": 1e9},
-    )
+    found = reply(served(tmp_path), "get_topic_in_last", CHATTER)
     is_needed = shipped < 3
     assert found["total"] == 10 * shipped + (len(stayed) if is_needed else 0)
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "n"}
@@ -269,12 +264,10 @@ async def test_a_server_looks_at_what_was_shipped_before_it_is_asked_and_for_lat
             while "cellar" not in fleet.robots or None in published():
                 await anyio.sleep(0.01)
             tasks.cancel_scope.cancel()
-    latest = {
-        name: snapshot and snapshot.latest
-        for name, snapshot in zip(fleet.robots, published(), strict=True)
-    }
+    latest = [snapshot and snapshot.latest for snapshot in published()]
     last = (START_S + 2) * NS_PER_S
-    assert latest == {"hall": last, "attic": None, "roof": last, "cellar": last}
+    assert [*fleet.robots] == ["hall", "attic", "roof", "cellar"]
+    assert latest == [last, None, last, last]
 
 
 def test_an_engine_has_the_settings_of_its_group_and_is_named_with_its_extra(

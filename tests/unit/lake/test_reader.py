@@ -1,6 +1,7 @@
 """What a lake has of a robot's bags is read as its bags are."""
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from random import Random
 
@@ -64,9 +65,11 @@ def test_copies_among_images_are_told_by_their_publish_times(tmp_path: Path) -> 
         messages: list[Msg] = []
         for n in beats:
             sent = AT + n * NS_PER_S
-            said = replace(text(sent + recording, f"{n}"), publish_time=sent)
             image = Msg("/camera", "sensor_msgs/msg/Image", sent + recording, b"%06d" % n, sent)
-            messages += [said, image]
+            messages += [
+                image,
+                replace(text(0, f"{n}"), log_time=image.log_time, publish_time=sent),
+            ]
         write_mcap(tmp_path / "bags" / f"r{recording}" / f"r{recording}_0.mcap", messages)
     bags, robot = shipped(tmp_path)
     span = {"start": START_S - 1, "end": START_S + 99, "by": "day"}
@@ -119,23 +122,20 @@ def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
 def test_messages_of_one_log_time_keep_the_order_of_the_file(tmp_path: Path) -> None:
     """Those of a topic with two channels, and of several topics."""
     draw, stamped = Random(5), "ros2_vision_interfaces/msg/StampedString"
+    kinds = [("/said", "std_msgs/msg/String"), ("/said", stamped), ("/heard", stamped)]
     messages: list[Msg] = []
     for beat in range(40):
         at = AT + beat // 4 * NS_PER_S
-        kinds = [("/said", "std_msgs/msg/String"), ("/said", stamped), ("/heard", stamped)]
-        for topic, kind in draw.sample(kinds, 2):
-            messages.append(Msg(topic, kind, at, draw.randbytes(9), at - 5))
+        messages += (Msg(*kind, at, draw.randbytes(9), at - 5) for kind in draw.sample(kinds, 2))
         messages.append(text(AT + beat * NS_PER_S + 7, "alone", topic="/alone"))
     write_mcap(tmp_path / "bags" / "r0" / "one_0.mcap", messages)
     on_robot = robot_bags("hall", tmp_path / "bags")
     assert ship(tmp_path / "lake", [on_robot]).bags == 1
     bags, robot = on_robot.memory, lake_robot(tmp_path / "lake")
     [bag], [other] = bags.index.snapshot().bags, robot.index.snapshot().bags
-    for topics in (["/said"], ["/said", "/heard", "/alone"]):
-        for newest_first in (False, True):
-            how = {"newest_first": newest_first}
-            found = [*robot.reader.records(other.path, topics, EVERYTHING, **how)]
-            assert found == [*bags.reader.records(bag.path, topics, EVERYTHING, **how)]
+    for topics, newest in product((["/said"], ["/said", "/heard", "/alone"]), (False, True)):
+        found = robot.reader.records(other.path, topics, EVERYTHING, newest_first=newest)
+        assert [*found] == [*bags.reader.records(bag.path, topics, EVERYTHING, newest_first=newest)]
     # Where no channel shares a log time with another, no place is stored.
     rows = {row["topic"]: row["packed"] for row in lake_rows(tmp_path / "lake", "channels")}
     assert decompress(rows["/alone"])[0] == 1

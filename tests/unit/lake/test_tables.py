@@ -53,7 +53,8 @@ def test_rows_are_sorted_and_lie_by_robot_and_day_in_zstd(catalog: SqlCatalog) -
 
 def test_an_older_lake_gets_the_columns_that_are_new(catalog: SqlCatalog) -> None:
     catalog.create_namespace_if_not_exists(NAMESPACE)
-    keys = pa.schema([(name, pa.string()) for name in KEYS])
+    kinds = zip(KEYS, (pa.string(), pa.string(), pa.date32()), strict=True)
+    keys = pa.schema([pa.field(*kind, nullable=False) for kind in kinds])
     catalog.create_table(f"{NAMESPACE}.things", keys)
     table = open_tables(catalog, ["things"])["things"]
     assert table.schema().column_names == [*TABLES["things"].columns]

@@ -8,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.storage.base import BagReader, Channel, Record, Schema
-from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import UnreadableError, reading
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap.bulk import ReadChunks
@@ -219,27 +217,6 @@ def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> No
         decoding.decode(record)
     nothing = record._replace(payload=b"\x00\x01\x00\x00\x00")
     assert decoding.decode(nothing) is not None
-
-
-TENTH = NS_PER_S // 10
-
-
-@given(st.lists(st.integers(0, 400), min_size=1), st.integers(1, 12), st.integers(1, 50))
-@example([0, 100, 91, 82, 73, 64, 110], 7, 7)
-@example([0, 100, 91, 82, 73, 64, 110], 1, 7)
-def test_a_clock_that_goes_back_does_so_as_far_however_the_file_is_cut(
-    tenths: list[int], chunk_size: int, at_once: int
-) -> None:
-    """As far as a message lies before any earlier one."""
-    times = np.array(tenths, np.int64) * TENTH
-    chunks = np.arange(times.size) // chunk_size
-    tally = Tally()
-    for begin in range(0, times.size, at_once):
-        part = times[begin : begin + at_once]
-        tally.add(np.zeros_like(part), part, chunks[begin : begin + at_once])
-    by, at = tally.contents().set_back
-    assert by == max(np.maximum.accumulate(times) - times)
-    assert by == 0 or at in times
 
 
 def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
