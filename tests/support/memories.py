@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -31,6 +31,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies, Reply
+from tests.support.bags import Msg, write_mcap
 from tests.support.clocks import SettableClock
 
 LAST_WRITTEN = 1_800_000_000 * NS_PER_S
@@ -87,6 +88,12 @@ def memory_of(
     columns = Scanner(None, bag_dir)
     memory = Memory(index, reader, extractor(), timed, settings, scanner=columns)
     return with_store(memory, bag_dir) if recalls else memory
+
+
+def remembered(bag_dir: Path, messages: Iterable[Msg], **how: Any) -> Memory:
+    """The memory over a bag of these messages; see `memory_of`."""
+    write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
+    return memory_of(bag_dir, **how)
 
 
 each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])

@@ -222,13 +222,9 @@ def fleet_of(robots: str, *more: str) -> Settings:
 @pytest.mark.parametrize(
     ("preset", "storage", "recorder", "transport", "now"),
     [
-        ("robot", MCAP, ROS2BAG, "sse", "wall"),
-        ("spec", MCAP, ROS2BAG, "sse", "wall"),
-        ("robot_live", MCAP, ROS2BAG, "sse", "wall"),
-        ("query_only", ROSBAG2, NONE, "stdio", "wall"),
+        *((name, MCAP, ROS2BAG, "sse", "wall") for name in ("robot", "spec", "robot_live")),
+        *((name, ROSBAG2, NONE, "stdio", "wall") for name in ("query_only", "fleet", "lake")),
         ("replay", ROSBAG2, NONE, "stdio", "latest"),
-        ("fleet", ROSBAG2, NONE, "stdio", "wall"),
-        ("lake", ROSBAG2, NONE, "stdio", "wall"),
         ("local", MCAP, NONE, "stdio", "wall"),
     ],
 )

@@ -1,6 +1,6 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
@@ -24,7 +24,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, remembered
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -73,22 +73,13 @@ def fix(ns: int, north: float, status: int = 0) -> Msg:
 FIXES = [fix(T0 + n * S, n * 1e-5) for n in range(60)]
 
 
-@lru_cache(maxsize=2)
-def remembered(bag_dir: Path, recalls: bool) -> Memory:
-    return memory_of(bag_dir, recalls=recalls)
-
-
-def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
-    return asked(remembered(bag_dir, recalls), tool, **given)
-
-
 GLOBAL = "px4_msgs/msg/VehicleGlobalPosition"
 
 
 def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
     scaled = make(GLOBAL, timestamp=0, lat=545000000.0, lon=102500000.0, alt=40.0)
-    write_mcap(tmp_path / "bag.mcap", [Msg("/where", GLOBAL, T0, scaled)])
-    refused = ask(tmp_path, False, "get_position_at", topic="/where", timestamp=T0_S)
+    memory = remembered(tmp_path, [Msg("/where", GLOBAL, T0, scaled)])
+    refused = asked(memory, "get_position_at", topic="/where", timestamp=T0_S)
     assert "carries no position" in refused["detail"]
 
 
@@ -96,20 +87,20 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map_and_its_numbers_are_t
     tmp_path: Path,
 ) -> None:
     states = [fix(T0 + n * S, n * 1e-5, -1 if n == 4 else 0) for n in range(9)]
-    write_mcap(tmp_path / "bag.mcap", states)
+    memory = remembered(tmp_path, states)
     for at, has_fix in ((4, False), (5, True)):
-        found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + at, topic="/fix")
+        found = asked(memory, "get_position_at", timestamp=T0_S + at, topic="/fix")
         assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
         assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
-    view = View(remembered(tmp_path, False), Call())
+    view = View(memory, Call())
     fixes = fixes_in(view, "/fix", TimeWindow.everything())
     assert [at for at, _ in fixes] == [T0 + n * S for n in range(9) if n != 4]
     height = {"topic": "/fix", "fields": ["altitude"], "start": T0_S}
     for given in ({}, {"by": "hour"}):
-        reply = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 8, **height, **given)
+        reply = asked(memory, "get_topic_in_range", end=T0_S + 8, **height, **given)
         told = [note for note in reply["notes"] if note.startswith(f"until {T0_S + 4}")]
         assert "have no fix (fix_status -1)" in told[0]
-    before = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 3, **height)
+    before = asked(memory, "get_topic_in_range", end=T0_S + 3, **height)
     assert not any("no fix" in note for note in before.get("notes", ()))
 
 
@@ -118,8 +109,8 @@ def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
     tmp_path: Path, recalls: bool
 ) -> None:
     """As in the fields that are shown."""
-    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n) for n in range(9)])
-    of_vehicle = partial(ask, tmp_path, recalls, topic=VEHICLE)
+    poses = [vehicle(T0 + n * S, n) for n in range(9)]
+    of_vehicle = partial(asked, remembered(tmp_path, poses, recalls=recalls), topic=VEHICLE)
     for field, value, last in (
         ("velocity.0", 0.5, 8),
         ("position.0", 5, 5),
@@ -133,7 +124,7 @@ def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
 
 
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n) for n in range(9)])
+    memory = remembered(tmp_path, [vehicle(T0 + n * S, n) for n in range(9)])
     above = {"topic": "/*odometry", "condition_type": "above", "value": 1.0, "field": "position.z"}
     note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
     for tool, given in (
@@ -142,10 +133,10 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
         ("find_matches", above),
         ("find_last_match", above),
     ):
-        assert note in ask(tmp_path, False, tool, **given)["notes"]
+        assert note in asked(memory, tool, **given)["notes"]
     other = [vehicle(T0 + n * S, n, "/r2/odometry") for n in range(9)]
     write_mcap(tmp_path / "other.mcap", other)
-    assert ask(tmp_path, False, "find_matches", **above)["notes"].count(note) == 1
+    assert asked(memory, "find_matches", **above)["notes"].count(note) == 1
 
 
 @each_way
@@ -161,8 +152,7 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
 def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", FIXES[:9])
-    reply = ask(tmp_path, recalls, tool, **given)
+    reply = asked(remembered(tmp_path, FIXES[:9], recalls=recalls), tool, **given)
     detail = reply["notes"][0] if tool == "recap" else reply["detail"]
     assert "data.pose_topic=/fix" not in detail
     assert "give topic" not in detail
@@ -186,23 +176,23 @@ def moved(tenths: range) -> list[Msg]:
 @each_way
 def test_in_a_gap_of_transforms_no_position_is_known(tmp_path: Path, recalls: bool) -> None:
     messages = [*moved(range(100)), *moved(range(400, 600)), *FIXES]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    memory = remembered(tmp_path, messages, recalls=recalls)
     for given in ({}, {"frame_id": "odom"}, {"topic": "/tf"}):
-        reply = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 25, **given)
+        reply = asked(memory, "get_position_at", timestamp=T0_S + 25, **given)
         assert (reply["error"], reply["reason"]) == ("no_data", "gap")
         assert "no message of /tf within 10 s" in reply["detail"]
         assert "latitude and longitude are on /fix" in reply["detail"]
-    reply = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 25, topic="/fix")
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 25, topic="/fix")
     assert (reply["x"], reply["latitude"]) == (None, 48.1237067)
 
 
 def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", moved(range(0, 600, 10)))
-    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 20.5)
+    memory = remembered(tmp_path, moved(range(0, 600, 10)))
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 20.5)
     assert reply["reason"] == "between_messages"
-    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 20.5, tolerance_s=1)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 20.5, tolerance_s=1)
     assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
-    refused = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 1)["detail"]
+    refused = asked(memory, "get_velocity_at", timestamp=T0_S + 1)["detail"]
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
 
 
@@ -216,8 +206,8 @@ def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
         )
         for n in range(9)
     ]
-    write_mcap(tmp_path / "rec_0" / "rec_0_0.mcap", messages)
-    notes = ask(tmp_path, False, "visits", x=5.0, y=0.0)["notes"]
+    memory = remembered(tmp_path, messages)
+    notes = asked(memory, "visits", x=5.0, y=0.0)["notes"]
     assert "by transforms, of one/base_link: no topic has the robot's poses" in notes
     assert "not of two/base_link, as of other robots" in notes
 
@@ -229,7 +219,6 @@ def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_pat
         at = T0 + n * S
         body = transform(at, "odom", "base_link", (3.0, 0.0, 0.0))
         messages += [odom(at, 3.0, 0.0), tf(at, body), boolean(at, n == 30)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     places = (
         Place("pen", "odom", Circle(3.0, 0.0, 1.0)),
         Place("dock", "map", Circle(13.0, 0.0, 0.5)),
@@ -237,7 +226,7 @@ def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_pat
         Place("hall", "map", Circle(3.0, 0.0, 0.5)),
         Place("lab", "site", Circle(3.0, 0.0, 0.5)),
     )
-    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
+    memory = remembered(tmp_path, messages, limits=QuerySettings(places=places))
     there = asked(memory, "get_position_at", timestamp=T0_S + 1)
     events = asked(memory, "recap", start=T0_S, end=T0_S + 59)["events"]
     assert len(events) >= 3
@@ -254,8 +243,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
     messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
     messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
     messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
-    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, messages)
     later = {"start": T0_S + 40, "end": T0_S + 59}
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 50}),
@@ -285,9 +273,8 @@ def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
     messages += [
         tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(120)
     ]
-    write_mcap(tmp_path / "r" / "r_0.mcap", messages)
     den = Place("den", "odom", Circle(9.0, 0.0, 0.5))
-    memory = memory_of(tmp_path, limits=QuerySettings(places=(den,)))
+    memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
     where = {"den": "den", "spot": {"x": 3.0, "y": 0.0, "radius_m": 1.0}}
     first = {"start": T0_S, "end": T0_S + 59}
     second = {"with_start": T0_S + 60, "with_end": T0_S + 119}

@@ -126,7 +126,7 @@ module a_msgs {{
       text="A is (nested (twice))")
     struct A {{
       @unit (value="m")
-      double x;
+      double x; boolean on; float least; builtin_interfaces::msg::Time at;
       /* of parts */ sequence<a_msgs::msg::B, 4> parts;
       @default (value=7)
       long corners[2];
@@ -140,13 +140,20 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
     found = lookup("a_msgs/msg/A", whole, "ros2idl")
     same = lookup(
         "a_msgs/msg/A",
-        f"float64 x\nB[<=4] parts\nint32[2] corners\n{RULE}\nMSG: a_msgs/B\nbyte value\n"
+        "float64 x\nbool on\nfloat32 least\nbuiltin_interfaces/Time at\n"
+        f"B[<=4] parts\nint32[2] corners\n{RULE}\nMSG: a_msgs/B\nbyte value\n"
         "string name\n",
     )
-    payload = CDR + np.array([1.5]).tobytes() + b"\x01\0\0\0\x05\0\0\0\x03\0\0\0hi\0\0"
+    payload = (
+        CDR
+        + np.array([1.5]).tobytes()
+        + b"\1\0\0\0"
+        + bytes(12)
+        + b"\x01\0\0\0\x05\0\0\0\x03\0\0\0hi\0\0"
+    )
     payload += np.array([8, 9], dtype=np.int32).tobytes()
     message, plain = decoded(found, payload), decoded(same, payload)
-    for field in ("x", "parts", "corners"):
+    for field in ("x", "on", "least", "at", "parts", "corners"):
         assert repr(getattr(message, field)) == repr(getattr(plain, field))
     assert list(getattr(message, "corners", ())) == [8, 9]
 

@@ -40,15 +40,6 @@ NUMBERS = (
     *("int64", "uint64", "float32", "float64"),
 )
 TIME, DURATION = "builtin_interfaces/Time", "builtin_interfaces/Duration"
-_IDL = {
-    "bool": "boolean",
-    "byte": "octet",
-    "char": "uint8",
-    "float32": "float",
-    "float64": "double",
-    TIME: "builtin_interfaces::msg::Time",
-    DURATION: "builtin_interfaces::msg::Duration",
-}
 
 _TIME_TEXT = "int32 sec\nuint32 nanosec\n"
 
@@ -74,27 +65,10 @@ class DrawnTypes:
 
     def msg(self) -> str:
         """The definition as ros2msg, nested types behind it."""
-        parts = [_msg(fields) for _, fields in self.types]
-        nested = [
-            f"{'=' * 80}\nMSG: drawn_msgs/{name}\n{part}"
-            for (name, _), part in zip(self.types[:-1], parts[:-1], strict=True)
-        ]
-        times = [f"{'=' * 80}\nMSG: {name}\n{_TIME_TEXT}" for name in (TIME, DURATION)]
-        return "".join([parts[-1], *nested, *times])
-
-    def idl(self) -> str:
-        """The definition as ros2idl."""
-        parts = [
-            f"{'=' * 80}\nIDL: drawn_msgs/msg/{name}\n"
-            f"module drawn_msgs {{ module msg {{ {_idl(name, fields)} }}; }};\n"
-            for name, fields in reversed(self.types)
-        ]
-        parts += [
-            f"{'=' * 80}\nIDL: builtin_interfaces/msg/{name}\nmodule builtin_interfaces {{ module "
-            f"msg {{ struct {name} {{ int32 sec; uint32 nanosec; }}; }}; }};\n"
-            for name in ("Time", "Duration")
-        ]
-        return "".join(parts)
+        nested = {f"drawn_msgs/{name}": _msg(fields) for name, fields in self.types[:-1]}
+        nested |= dict.fromkeys((TIME, DURATION), _TIME_TEXT)
+        parts = [f"{'=' * 80}\nMSG: {name}\n{part}" for name, part in nested.items()]
+        return "".join([_msg(self.types[-1][1]), *parts])
 
     def store(self) -> Typestore:
         """A typestore of them; bytes are unsigned, as in ROS, which rosbags has signed."""
@@ -114,21 +88,6 @@ def _msg(fields: Sequence[DrawnField]) -> str:
     return "".join(
         f"{each.kind}{arrays.get(each.length, f'[{each.length}]')} {each.name}\n" for each in fields
     )
-
-
-def _idl(name: str, fields: Sequence[DrawnField]) -> str:
-    lines = []
-    for each in fields:
-        kind = _IDL.get(each.kind, each.kind)
-        if each.kind not in {*NUMBERS, "string", TIME, DURATION}:
-            kind = f"drawn_msgs::msg::{each.kind}"
-        if each.length == -1:
-            kind = f"sequence<{kind}>"
-        size = "" if each.length in {None, -1} else f"[{each.length}]"
-        lines.append(f"{kind} {each.name}{size};")
-    if not fields:
-        lines.append("uint8 structure_needs_at_least_one_member;")
-    return f"struct {name} {{ {' '.join(lines)} }};"
 
 
 _PRIMITIVES = st.sampled_from([*NUMBERS, "string", "string", TIME, DURATION])
@@ -192,18 +151,11 @@ def decoded_alike(reader: BagReader, path: Path) -> None:
         assert table.log_times.tolist() == [record.log_time for record in kept]
 
 
-def bag_of(
-    path: Path,
-    types: DrawnTypes,
-    payloads: Sequence[bytes],
-    *,
-    is_idl: bool = False,
-) -> Path:
+def bag_of(path: Path, types: DrawnTypes, payloads: Sequence[bytes]) -> Path:
     """A bag of one topic."""
 
     def fill(writer: Writer) -> None:
-        encoding, definition = ("ros2idl", types.idl()) if is_idl else ("ros2msg", types.msg())
-        schema = writer.register_schema(types.root, encoding, definition.encode())
+        schema = writer.register_schema(types.root, "ros2msg", types.msg().encode())
         channel = writer.register_channel("/drawn", "cdr", schema)
         for nth, payload in enumerate(payloads):
             writer.add_message(channel, 10 + nth, payload, 5 + nth)
@@ -252,10 +204,9 @@ def test_bags_of_public_robots_are_decoded_as_rosbags_does(
     seed=st.integers(0, 2**32),
     longest=st.sampled_from((0, 1, 3, 12)),
     is_little=st.sampled_from((True, True, True, False)),
-    is_idl=st.booleans(),
 )
 def test_messages_of_any_definition_are_decoded_as_rosbags_does(
-    types: DrawnTypes, seed: int, longest: int, is_little: bool, is_idl: bool
+    types: DrawnTypes, seed: int, longest: int, is_little: bool
 ) -> None:
     chance = random.Random(seed)
     store = types.store()
@@ -272,7 +223,7 @@ def test_messages_of_any_definition_are_decoded_as_rosbags_does(
     if sum(map(len, payloads)) > 1 << 20:
         return
     with tempfile.TemporaryDirectory() as folder:
-        path = bag_of(Path(folder) / "drawn.mcap", types, payloads, is_idl=is_idl)
+        path = bag_of(Path(folder) / "drawn.mcap", types, payloads)
         [table] = tables_of(McapReader(), path)
         assert table.left_out.get("") is None
         comparison = Comparison()

@@ -18,9 +18,8 @@ from tests.support.bags import (
     make,
     octets,
     typestore,
-    write_mcap,
 )
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, remembered, with_store
 
 T0 = 1_790_000_000 * NS_PER_S
 
@@ -36,8 +35,7 @@ def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> M
 def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
     tmp_path: Path, *, recalls: bool
 ) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [octets(T0, [7] * 100, "/data")])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, [octets(T0, [7] * 100, "/data")], recalls=recalls)
     for condition, number in (("above", 50), ("below", 0), ("equals", 100), ("contains", 10)):
         asks = {"topic": "/*", "condition_type": condition, "value": number}
         ask = partial(asked, memory, "find_last_match", **asks)
@@ -74,13 +72,13 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
         elbows.append(angles.get("elbow"))
         if angles.get("elbow", 0.0) > 0.5:
             bent.append(T0 / NS_PER_S + nth)
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    plain = remembered(tmp_path, messages)
     stated = [angle for angle in elbows if angle is not None]
     states = [is_bent for is_bent, _ in groupby(angle > 0.5 for angle in stated)]
     window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
     elbow = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
     left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
-    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+    for memory in (plain, with_store(plain, tmp_path)):
         ask = partial(asked, memory, topic="/joints")
         assert ask(name="find_last_match", **elbow)["timestamp"] == bent[-1]
         runs = ask(name="find_matches", **elbow, limit=100)["sightings"]

@@ -27,7 +27,7 @@ from ros2_memory.queries import find_last_match
 from tests.support.bags import Msg, odom, text, write_mcap, write_splits
 from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
 from tests.support.examples import examples
-from tests.support.memories import asked, assert_same_counts, memory_of
+from tests.support.memories import asked, assert_same_counts, remembered
 
 S = 10**9
 T0 = 1_700_000_400 * S
@@ -39,8 +39,7 @@ def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
     most = 50_000
     monkeypatch.setattr("ros2_memory.columns.scan._MOST_BYTES", most)
     said = [text(T0 + nth * S, f"{nth:02d}" + "a" * 10_000) for nth in range(20)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", said)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, said)
     tables = [rows.table for rows in scan(View(memory, Call()), "/chatter", EVERYTHING)]
     assert sum(map(len, tables)) == len(said)
     assert sum(table.memory_bytes for table in tables) < most

@@ -20,7 +20,7 @@ from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, Offset, Time
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, text, write_mcap, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import write_moving_map
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
@@ -241,8 +241,8 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
     ],
 )
 def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[str, Any]) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [detections(BEGIN * S, ["cup"])])
-    reply = asked(memory_of(tmp_path), "find_matches", **{**ANY, **given})
+    memory = remembered(tmp_path, [detections(BEGIN * S, ["cup"])])
+    reply = asked(memory, "find_matches", **{**ANY, **given})
     assert reply["error"] == "invalid_arguments"
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 

@@ -253,5 +253,5 @@ def test_past_what_is_on_disk_the_answer_says_where_that_ends(tail: Tail) -> Non
 def test_a_first_split_of_which_nothing_is_on_disk_yet_is_no_empty_memory(tail: Tail) -> None:
     tail.write("rec/rec_0.mcap", b"", at=S)
     reply = tail.asked("get_position_seconds_ago", seconds_ago=1)
-    assert reply["reason"] == "not_closed_yet"
-    assert reply["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
+    detail = "nothing of the first split is on disk yet; ask again in 3 s"
+    assert (reply["reason"], reply["detail"]) == ("not_closed_yet", detail)

@@ -25,7 +25,7 @@ from ros2_memory.lake.select import ALLOCATORS, Select, check_select
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, START_S, reply_of
-from tests.support.lakes import lake_in, lake_robots, robot_bags, ship, write_bag
+from tests.support.lakes import lake_in, lake_robots, ship_from, write_bag
 from tests.support.memories import memory_of
 
 HALL, ATTIC, UNSHIPPED = "hall", "attic", "cellar"
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, bags in ((HALL, 3), (ATTIC, 2)):
         for number in range(bags):
             write_bag(folder / name, number)
-    ship(folder / "lake", [robot_bags(name, folder / name) for name in (HALL, ATTIC)])
+    ship_from(folder, HALL, ATTIC)
     return folder
 
 
@@ -228,7 +228,7 @@ def test_its_process_ends_by_itself_should_the_server_be_killed() -> None:
 
 def test_a_file_that_is_damaged_is_reported_without_its_path(tmp_path: Path) -> None:
     write_bag(tmp_path / HALL, 0)
-    ship(tmp_path / "lake", [robot_bags(HALL, tmp_path / HALL)])
+    ship_from(tmp_path)
     lake = Lake(lake_in(tmp_path / "lake"))
     fleet = Fleet([Robot(HALL, tmp_path, memory_of(tmp_path))], FixedClock(NOW), tables=lake)
     for file in (tmp_path / "lake" / "ros2_memory" / "sightings").rglob("*.parquet"):

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
+from urllib.request import Request, urlopen
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
@@ -19,11 +20,15 @@ from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.store import FILE
 from ros2_memory.columns.units import GoneError
+from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
+from ros2_memory.lake.warehouse import LakeLocation
 from tests.support.bags import detections, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.examples import LONG
 from tests.support.fakes import failing
 from tests.support.fleets import START_S
 from tests.support.lakes import (
@@ -345,3 +350,42 @@ def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path
         where = replace(location(tmp_path / "lake"), catalog="rest", uri=uri)
         ship_and_ask(where, tmp_path / "hall")
         assert where.last_change() is not None
+
+
+@pytest.mark.skipif(not LONG, reason="starts an S3 server: EPISODIC_LONG=1")
+def test_bags_are_shipped_once_into_a_bucket_asked_and_forgotten(tmp_path: Path) -> None:
+    """The store is moto's server, which is in no lock, since it brings forty packages.
+
+    `EPISODIC_LONG=1 uv run --with "moto[s3,server]" pytest -n0 tests/unit/lake/test_shipper.py`.
+    """
+    moto = pytest.importorskip("moto.server", reason="needs moto, which no lock has")
+    secret = "very-secret-key"  # noqa: S105 - of no account
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        where = LakeLocation(
+            "s3://robots/lake",
+            tmp_path / "state",
+            properties={"s3.endpoint": f"http://{host}:{port}", "s3.region": "us-east-1"},
+            secrets={"s3.access-key-id": "ship", "s3.secret-access-key": secret},
+        )
+        where.state_dir.mkdir()
+        endpoint = where.properties["s3.endpoint"]
+        urlopen(Request(f"{endpoint}/robots", method="PUT")).close()  # noqa: S310 - of this host
+        for _ in range(2):
+            where.claim()
+        (tmp_path / "other").mkdir()
+        with pytest.raises(LakeError, match="another writer"):
+            replace(where, state_dir=tmp_path / "other").claim()
+        ship_and_ask(where, tmp_path / "hall")
+        with where.writable() as tables:
+            assert forget_in_lake(tables, Tombstone("hall", 0, LATER)).bags == 2
+        with urlopen(f"{endpoint}/robots?list-type=2") as listing:  # noqa: S310 - of this host
+            objects = listing.read().decode()
+        assert ".metadata.json" in objects
+        assert ".parquet" not in objects
+        kept = [each for each in (tmp_path / "state").rglob("*") if each.is_file()]
+        assert not any(secret.encode() in each.read_bytes() for each in kept)
+    finally:
+        server.stop()

@@ -2,7 +2,7 @@
 
 import os
 import tempfile
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from operator import itemgetter
@@ -196,16 +196,17 @@ def test_what_is_gone_has_vanished_and_what_is_no_bag_is_closed_and_its_fault_re
 
 
 @on_every_shelf
-@pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
 def test_a_folder_or_a_pipe_in_place_of_a_bag_is_an_error_that_names_it(
-    shelf: Shelf, tmp_path: Path, make: Callable[[Path], None]
+    shelf: Shelf, tmp_path: Path
 ) -> None:
-    path = tmp_path / f"odd{shelf.suffix}"
-    make(path)
-    with pytest.raises(BagError, match="not a regular file"):
-        shelf.make_reader().summarize(path)
-    with pytest.raises(EpisodicError):
-        shelf.make_reader().closing(path)
+    folder, pipe = (tmp_path / f"{name}{shelf.suffix}" for name in ("folder", "pipe"))
+    folder.mkdir()
+    os.mkfifo(pipe)
+    for path in (folder, pipe):
+        with pytest.raises(BagError, match="not a regular file"):
+            shelf.make_reader().summarize(path)
+        with pytest.raises(EpisodicError):
+            shelf.make_reader().closing(path)
 
 
 @on_every_shelf

@@ -190,33 +190,28 @@ def test_no_buffer_has_more_than_its_share_of_small_chunks(
     assert [time for batch in batches for time in batch.log_times.tolist()] == list(range(40))
 
 
-def record_of(message: Msg, schema: Schema | None = None) -> Record:
-    given = schema or Schema(message.type, "ros2msg", definition(message.type).encode())
-    return Record(Channel(message.topic, "cdr", given), 1, 1, message.payload)
+def decoded(type_name: str, payload: bytes, text: str) -> object:
+    schema = Schema(type_name, "ros2msg", text.encode())
+    return McapReader().decode(Record(Channel("/any", "cdr", schema), 1, 1, payload))
 
 
 def test_big_endian_messages_are_read() -> None:
-    payload = b"\x00\x00\x00\x00" + b"\x00\x00\x00\x03hi\x00"
-    record = record_of(text(1, "x"))._replace(payload=payload)
-    assert getattr(McapReader().decode(record), "data", "") == "hi"
+    found = decoded("a_msgs/msg/A", bytes(4) + b"\x00\x00\x00\x03hi\x00", "string data")
+    assert getattr(found, "data", "") == "hi"
 
 
 def test_every_cut_of_a_payload_is_undecodable_and_nothing_else() -> None:
-    whole = record_of(odom(1, 2.0, 3.0))
-    decoding = McapReader()
+    whole = odom(1, 2.0, 3.0)
     for size in range(len(whole.payload)):
         with pytest.raises(UndecodableError):
-            decoding.decode(whole._replace(payload=whole.payload[:size]))
-    assert decoding.decode(whole)
+            decoded(whole.type, whole.payload[:size], definition(whole.type))
+    assert decoded(whole.type, whole.payload, definition(whole.type))
 
 
 def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> None:
-    record = record_of(text(1, "a text"), Schema("a_msgs/msg/Lost", "ros2msg", b""))
-    decoding = McapReader()
     with pytest.raises(UndecodableError, match=r"reader\.custom_msg_paths"):
-        decoding.decode(record)
-    nothing = record._replace(payload=b"\x00\x01\x00\x00\x00")
-    assert decoding.decode(nothing) is not None
+        decoded("a_msgs/msg/Lost", text(1, "a text").payload, "")
+    assert decoded("a_msgs/msg/Lost", b"\x00\x01\x00\x00\x00", "") is not None
 
 
 def test_a_place_past_all_that_can_be_counted_is_damage() -> None:
