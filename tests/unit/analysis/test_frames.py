@@ -12,12 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
 
-from ros2_memory.analysis.frames import (
-    HOLD_NS,
-    TF_CACHE_NS,
-    FrameTree,
-    edges_of,
-)
+from ros2_memory.analysis.frames import HOLD_NS, TF_CACHE_NS, FrameTree, edges_of
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import StampedTransform, Transform
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, ns_from_unix
@@ -36,11 +31,9 @@ def edge(
     static: bool = False,
 ) -> StampedTransform:
     """An edge stamped at `time`; a number stands for a shift along x."""
-    held = (
-        transform
-        if isinstance(transform, Transform)
-        else Transform((transform, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    )
+    held = transform
+    if not isinstance(held, Transform):
+        held = Transform((held, 0.0, 0.0), IDENTITY.rotation)
     return StampedTransform(parent, child, time, time, held, static)
 
 

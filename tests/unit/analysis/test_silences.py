@@ -32,9 +32,8 @@ class Activity(NamedTuple):
 def heard(*runs: tuple[int, int]) -> Activity:
     """A topic that is recorded once in a second during runs."""
     length = sum(last - first for first, last in runs)
-    count = length // S
-    spacings = {0: Spacing(len(runs), length, max(count, 1))}
-    return Activity(runs, Pacing(spacings, count, length))
+    spacings = {0: Spacing(len(runs), length, max(length // S, 1))}
+    return Activity(runs, Pacing(spacings, length // S, length))
 
 
 def found(odom: Activity, seen: Activity) -> list[Silence]:

@@ -33,7 +33,7 @@ def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> M
 
 @each_way
 def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, recalls: bool
 ) -> None:
     memory = remembered(tmp_path, [octets(T0, [7] * 100, "/data")], recalls=recalls)
     for condition, number in (("above", 50), ("below", 0), ("equals", 100), ("contains", 10)):

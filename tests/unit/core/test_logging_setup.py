@@ -62,7 +62,7 @@ def test_what_a_library_repeats_is_logged_now_and_then(
             logging.getLogger(logger).warning("Invalid HTTP request received.")
         logging.getLogger("asyncio").error("Fatal error: protocol.data_received() call %d", second)
         get_logger("ros2_memory.test").warning("ours")
-    logged = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    logged = events(capsys)
     counts = Counter(each["logger"] for each in logged)
     ours = {"ros2_memory.test": 25}
     assert counts == {"uvicorn.error": 3, "asyncio": 6, "mcp.server.sse": 3, **ours}

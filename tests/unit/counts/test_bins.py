@@ -251,7 +251,7 @@ T = 1_790_000_000
 
 
 @each_way
-def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, recalls: bool) -> None:
     both, butter = ["Knife", "butter knife"], ["butter knife"]
     seen = [both if at < 20 else butter for at in range(40)]
     messages = [
@@ -270,7 +270,7 @@ def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool
 
 @each_way
 def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, recalls: bool
 ) -> None:
     """A text for 100 s, then a boolean; true for 10 s of 20, and nothing or false in between."""
     said = [

@@ -170,7 +170,7 @@ def write_numbers(bag_dir: Path, *values: tuple[str, float]) -> None:
     ],
 )
 def test_the_least_and_greatest_of_whole_numbers_are_exact(
-    tmp_path: Path, kind: str, numbers: list[int], *, recalls: bool
+    tmp_path: Path, kind: str, numbers: list[int], recalls: bool
 ) -> None:
     write_numbers(tmp_path, *((kind, number) for number in numbers))
     memory = memory_of(tmp_path, recalls=recalls)

@@ -51,7 +51,7 @@ def matches(
     ],
 )
 def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_window(
-    bag_dir: Path, topic: str, first: int, last: int, held: int, began: int, *, recalls: bool
+    bag_dir: Path, topic: str, first: int, last: int, held: int, began: int, recalls: bool
 ) -> None:
     counted = matches(bag_dir, topic, first, last, by="day", recalls=recalls)
     whole = table(counted)["all"]
@@ -60,7 +60,7 @@ def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_windo
 
 @each_way
 def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, recalls: bool
 ) -> None:
     """auto from 0 to 45 s and from 70 s on; bumped from 20 to 30, from 40 to 50 and from 80 s."""
     bumps = [at for at in range(0, 101, 2) if 20 <= at < 30 or 40 <= at < 50 or at >= 80]
@@ -93,7 +93,7 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
 @each_way
 @pytest.mark.parametrize(("first", "began"), [(0, 3), (50, 3), (61, 2), (92, 1), (98, 0)])
 def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message_on(
-    tmp_path: Path, first: int, began: int, *, recalls: bool
+    tmp_path: Path, first: int, began: int, recalls: bool
 ) -> None:
     """Nothing is recorded from 100 to 110 s, so when it began to be true at 115 s is not known."""
     changes = (0, False), (60, True), (65, False), (90, True), (91, False), (95, True), (96, False)
@@ -106,7 +106,7 @@ def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message
 
 @pytest.mark.parametrize(("split_s", "recalls"), [(10, False), (30, True), (600, True)])
 def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
-    tmp_path: Path, split_s: int, *, recalls: bool
+    tmp_path: Path, split_s: int, recalls: bool
 ) -> None:
     """Once a second, but not from 30, 80, 140 and 161 s on: false, true, true, true, then false."""
     times = [*range(30), *range(45, 80), *range(100, 140), 160, 161, *range(175, 300)]

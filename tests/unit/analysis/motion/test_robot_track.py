@@ -83,7 +83,8 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
         if thins:
             index = slot_ends(some[0])
             some = [column[index] for column in some]
-        return partial_track(*some)
+        times, x, y, heading = some
+        return partial_track(times, x, y, heading)
 
     whole = track_by(*joined_tracks([[part(0, 1500)]]))
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
