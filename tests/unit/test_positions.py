@@ -56,13 +56,13 @@ def vehicle(ns: int, x: float, topic: str = VEHICLE) -> Msg:
     return Msg(topic, "px4_msgs/msg/VehicleOdometry", ns, body)
 
 
-def fix(ns: int, north: float, status: int = 0) -> Msg:
+def fix(ns: int, north: float, east: float = 0.0, status: int = 0) -> Msg:
     body = make(
         "sensor_msgs/msg/NavSatFix",
         header=header(ns, "gps"),
         status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
         latitude=48.1234567 + north,
-        longitude=11.7654321,
+        longitude=11.7654321 + east,
         altitude=519.5,
         position_covariance=np.zeros(9),
         position_covariance_type=0,
@@ -86,7 +86,7 @@ def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
 def test_a_position_without_a_fix_says_so_and_is_in_no_map_and_its_numbers_are_told(
     tmp_path: Path,
 ) -> None:
-    states = [fix(T0 + n * S, n * 1e-5, -1 if n == 4 else 0) for n in range(9)]
+    states = [fix(T0 + n * S, n * 1e-5, status=-1 if n == 4 else 0) for n in range(9)]
     memory = remembered(tmp_path, states)
     for at, has_fix in ((4, False), (5, True)):
         found = asked(memory, "get_position_at", timestamp=T0_S + at, topic="/fix")

@@ -364,6 +364,7 @@ def _part_of(text: str, random: Random) -> str:
 def _test(leaf: Any, random: Random) -> Contains | Equals | Beyond:
     if leaf is None or (isinstance(leaf, float) and math.isnan(leaf)):
         leaf = 0
+    needles: list[Any]
     if isinstance(leaf, str):
         part = _part_of(leaf, random)
         needles = [leaf, leaf.upper(), part, f"{part}q"]

@@ -43,7 +43,7 @@ class Words(NamedTuple):
         return 100
 
 
-WORDS = FragmentKind("words", (Words,))
+WORDS: FragmentKind[Words] = FragmentKind("words", (Words,))
 
 
 def counted(bag_dir: Path, where: str, *given: bytes) -> int:

@@ -104,30 +104,22 @@ def drawn(
     return kept.tolist(), error_m
 
 
-def _off_segment(p: Vector3, a: Vector3, b: Vector3) -> float:
-    """Distance of a point from a segment, written independently of the code under test."""
-    start, along, to = np.array(a), np.array(b) - np.array(a), np.array(p) - np.array(a)
-    squared = float(along @ along)
-    ratio = 0.0 if squared == 0 else min(1.0, max(0.0, float(to @ along) / squared))
-    return float(np.linalg.norm(start + ratio * along - np.array(p)))
-
-
 def _recursive(
     path: Sequence[Vector3], seconds: Sequence[float], start: int, end: int, tolerance_m: float
 ) -> list[int]:
     """The points between two that are kept, by the textbook's recursion, point by point."""
-    a, b = np.array(path[start]), np.array(path[end])
-    lasted = seconds[end] - seconds[start]
+    a, way = np.array(path[start]), np.array(path[end]) - np.array(path[start])
+    squared, lasted = float(way @ way), seconds[end] - seconds[start]
     most, where, reach = 0.0, start, 0.0
     for nth in range(start + 1, end):
-        off = _off_segment(path[nth], path[start], path[end])
-        squared = float((b - a) @ (b - a))
-        along = 0.0 if squared == 0 else float((np.array(path[nth]) - a) @ (b - a)) / squared
-        reach = max(reach, min(max(along, 0.0), 1.0))
-        off = max(off, (reach - min(max(along, 0.0), 1.0)) * math.sqrt(squared) / 2)
+        point = np.array(path[nth])
+        ratio = min(max(float((point - a) @ way) / squared, 0.0), 1.0) if squared else 0.0
+        reach = max(reach, ratio)
+        off = float(np.linalg.norm(a + ratio * way - point))
+        off = max(off, (reach - ratio) * math.sqrt(squared) / 2)
         if lasted > 0:
-            then = a + (b - a) * (seconds[nth] - seconds[start]) / lasted
-            off = max(off, float(np.linalg.norm(np.array(path[nth]) - then)) / 10)
+            then = a + way * (seconds[nth] - seconds[start]) / lasted
+            off = max(off, float(np.linalg.norm(point - then)) / 10)
         if off > most + 1e-12:
             most, where = off, nth
     if most <= tolerance_m:
