@@ -91,16 +91,10 @@ def test_slerp_between_nearly_parallel_rotations_keeps_an_even_speed(
 
 
 def drawn(
-    path: Sequence[Vector3],
-    tolerance_m: float,
-    at_most: int,
-    seconds: Sequence[float] | None = None,
+    path: Sequence[Vector3], seconds: Sequence[float], tolerance_m: float, at_most: int
 ) -> tuple[list[int], float]:
-    """Of a path of one point at least; without seconds, time does not count."""
-    points = np.array(path, np.float64).reshape(-1, 3)
-    clock = np.zeros(len(path)) if seconds is None else np.array(seconds, np.float64)
-    ends = np.unique([0, len(path) - 1])
-    kept, error_m = simplified(points, clock, ends, tolerance_m=tolerance_m, at_most=at_most)
+    ends, columns = np.array([0, len(path) - 1]), (np.array(path), np.array(seconds))
+    kept, error_m = simplified(*columns, ends, tolerance_m=tolerance_m, at_most=at_most)
     return kept.tolist(), error_m
 
 
@@ -141,19 +135,19 @@ def test_a_path_is_simplified_as_by_the_recursion(
     noise = draw.normal(0.0, 1e-4, (300, 3))
     path = [(x, y, z) for x, y, z in (np.cumsum(steps, axis=0) + noise).tolist()]
     seconds = np.cumsum(draw.exponential(0.2, len(path))).tolist()
-    kept, error_m = drawn(path, tolerance_m, len(path), seconds)
+    kept, error_m = drawn(path, seconds, tolerance_m, len(path))
     last = len(path) - 1
     assert kept == [0, *_recursive(path, seconds, 0, last, tolerance_m), last]
     assert error_m <= tolerance_m
     # With one vertex fewer the worst intervals are split, and the rest is left as it is.
-    fewer, off_m = drawn(path, tolerance_m, len(kept) - 1, seconds)
+    fewer, off_m = drawn(path, seconds, tolerance_m, len(kept) - 1)
     assert set(fewer) < set(kept)
     assert off_m > tolerance_m
 
 
 def test_a_spiral_whose_splits_stay_lopsided_is_simplified_in_bounded_time() -> None:
     path = [(0.99**n, 0.0, float(n % 2) * 0.99**n) for n in range(3000)]
-    kept, error_m = drawn(path, 0.0, len(path))
+    kept, error_m = drawn(path, [0.0] * len(path), 0.0, len(path))
     assert kept == sorted(set(kept))
     assert error_m == 0.0
 

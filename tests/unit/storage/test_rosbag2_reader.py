@@ -7,7 +7,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -105,36 +105,28 @@ def test_a_time_that_no_clock_shows_is_left_out_and_reported(tmp_path: Path, tim
     assert (reply["bags"], reply["gaps"], reply["earliest"]) == (1, [], 0)
 
 
-@pytest.fixture
-def live(tmp_path: Path) -> Iterator[tuple[Path, sqlite3.Connection]]:
-    """A bag whose recorder writes ahead, as with rosbag2's `resilient` preset, and goes on."""
-    path = write_db3(tmp_path / "bags" / "live.db3", chatter(2))
-    with closing(sqlite3.connect(path)) as base:
+def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(tmp_path: Path) -> None:
+    """Of a recorder that writes ahead, as with rosbag2's `resilient` preset, and goes on."""
+    live, left = write_db3(tmp_path / "bags" / "live.db3", chatter(2)), tmp_path / "left"
+    insert, reader = "INSERT INTO messages VALUES (NULL,1,?,x'00')", Rosbag2Reader()
+    with closing(sqlite3.connect(live)) as base:
         base.execute("PRAGMA journal_mode=WAL").fetchall()
         base.execute("PRAGMA wal_autocheckpoint=0").fetchall()
-        payload = text(5, "in the WAL").payload
-        base.execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,5,?)", (payload,))
+        base.execute(insert, (5,))
         base.commit()
-        yield path, base
-
-
-def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(
-    live: tuple[Path, sqlite3.Connection], tmp_path: Path
-) -> None:
-    left = tmp_path / "left"
-    shutil.copytree(live[0].parent, left, ignore=shutil.ignore_patterns("*-shm"))
-    before = {file: file.read_bytes() for file in left.iterdir()}
-    assert len(before) == 2
-    path, reader = left / live[0].name, Rosbag2Reader()
-    summary = reader.summarize(path)
-    assert times(read(reader, path)) == times(read(reader, live[0])) == [0, 1, 5]
-    assert (summary.count, summary.complete) == (3, False)
-    assert summary.notes[0].startswith("its writer did not finish it")
-    assert {file: file.read_bytes() for file in left.iterdir()} == before
-    # One that grows is read anew.
-    live[1].execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,9,x'00')")
-    live[1].commit()
-    assert times(read(reader, live[0])) == [0, 1, 5, 9]
+        shutil.copytree(live.parent, left, ignore=shutil.ignore_patterns("*-shm"))
+        before = {file: file.read_bytes() for file in left.iterdir()}
+        assert len(before) == 2
+        path = left / live.name
+        summary = reader.summarize(path)
+        assert times(read(reader, path)) == times(read(reader, live)) == [0, 1, 5]
+        assert (summary.count, summary.complete) == (3, False)
+        assert summary.notes[0].startswith("its writer did not finish it")
+        assert {file: file.read_bytes() for file in left.iterdir()} == before
+        # One that grows is read anew.
+        base.execute(insert, (9,))
+        base.commit()
+        assert times(read(reader, live)) == [0, 1, 5, 9]
 
 
 def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path) -> None:
