@@ -157,8 +157,8 @@ HORSESHOE = Polygon(
 )
 
 
-def steps(draw: Random, count: int = 300) -> Steps:
-    points = np.array([(draw.uniform(-3, 6), draw.uniform(-3, 6)) for _ in range(count + 1)])
+def steps(draw: Random) -> Steps:
+    points = np.array([(draw.uniform(-3, 6), draw.uniform(-3, 6)) for _ in range(301)])
     points[5] = points[4]  # the robot stands
     return Steps(points[:-1, 0], points[:-1, 1], points[1:, 0], points[1:, 1])
 

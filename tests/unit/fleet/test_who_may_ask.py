@@ -6,7 +6,6 @@ The oracle is a fleet that does not have the other one: every reply is the same,
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -64,17 +63,12 @@ def opened() -> Iterator[list[str]]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Dispatcher, Dispatcher]]:
+    """What answers for all three, and what answers for the two alone."""
     folder = tmp_path_factory.mktemp("fleet")
     for name in (*MINE, OTHER):
         write_robot(seeded(name), folder / name)
     sys.addaudithook(_note)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def pair(folder: Path) -> Iterator[tuple[Dispatcher, Dispatcher]]:
-    """What answers for all three, and what answers for the two alone."""
 
     def over(names: tuple[str, ...]) -> Dispatcher:
         tools = fleet_tools(build_tools(QuerySettings()), fleet_over(folder, names), 24_000)

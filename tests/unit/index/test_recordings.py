@@ -24,6 +24,7 @@ from tests.support.listed_bags import odom_bag
 from tests.support.memories import LAST_WRITTEN, memory_of, with_store
 
 T0 = 1_700_000_000
+T0_NS = T0 * NS_PER_S
 
 
 def write(folder: Path, name: str, *, at_s: int = 0) -> None:
@@ -101,9 +102,6 @@ def test_times_that_recordings_share_are_those_of_all_their_bags(
         patch.setattr(timeline, "SEGMENT_BAGS", size)
         shared = timeline.Timeline.of(bags).shared_times
     assert shared == overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
-
-
-T0_NS = T0 * NS_PER_S
 
 
 def listed_recording(bag_dir: Path) -> Memory:

@@ -243,7 +243,7 @@ def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
 
 
 @pytest.fixture(scope="module")
-def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.
@@ -256,11 +256,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
         write_mcap(folder / "bags" / "rec" / f"rec_{7 - ago}.mcap", messages)
     ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
-    return lake_robot(folder / "lake", days=1, most_bags=1)
-
-
-@pytest.fixture
-def robot(memory: Memory) -> Robot:
+    memory = lake_robot(folder / "lake", days=1, most_bags=1)
     return Robot("hall", Path("/hall"), memory, in_lake=True)
 
 
