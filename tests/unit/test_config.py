@@ -285,6 +285,7 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
         ("recording.bag_dir='~nobody-here/x'", ["recording.bag_dir", "can be found"]),
         ("data.time_tolerance_s=true", ["data.time_tolerance_s: True", "valid number"]),
         ("data.max_plausible_speed_mps=nan", ["nan", "finite"]),
+        ("data.pose_topic=''", ["data.pose_topic: ''", "must not be empty"]),
         ("data.tf_topics=/tf", ["data.tf_topics: '/tf'", "must be a list"]),
         ("retention.max_total_gb='2GB'", ["'2GB'", "must be a number in GB, such as 2"]),
         ("recorder.setup_files=[/a", ["is not a setting", "where spaces"]),

@@ -17,6 +17,9 @@ from tests.support.bags import (
     header,
     make,
     octets,
+    point,
+    quaternion,
+    stamp,
     typestore,
 )
 from tests.support.memories import asked, each_way, remembered, with_store
@@ -31,12 +34,23 @@ def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> M
     return Msg("/joints", kind, at, make(kind, header=header(at, ""), name=[*names], **arrays))
 
 
+def grid() -> Msg:
+    """A map of which nothing is known."""
+    pose = make("geometry_msgs/msg/Pose", position=point(0, 0), orientation=quaternion(0))
+    numbers = {"resolution": 0.05, "width": 10, "height": 10}
+    info = make("nav_msgs/msg/MapMetaData", map_load_time=stamp(0), origin=pose, **numbers)
+    kind, unknown = "nav_msgs/msg/OccupancyGrid", np.full(100, -1, np.int8)
+    return Msg("/data", kind, T0, make(kind, header=header(0, "map"), info=info, data=unknown))
+
+
 @each_way
+@pytest.mark.parametrize("message", [grid(), octets(T0, [7] * 100, "/data")], ids=lambda m: m.type)
 def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, message: Msg, recalls: bool
 ) -> None:
-    memory = remembered(tmp_path, [octets(T0, [7] * 100, "/data")], recalls=recalls)
-    for condition, number in (("above", 50), ("below", 0), ("equals", 100), ("contains", 10)):
+    memory = remembered(tmp_path, [message], recalls=recalls)
+    tried = ("above", 50), ("below", 0), ("equals", 100), ("equals", -1), ("contains", 10)
+    for condition, number in tried:
         asks = {"topic": "/*", "condition_type": condition, "value": number}
         ask = partial(asked, memory, "find_last_match", **asks)
         assert "ask about data.bytes" in ask(field="data")["detail"]

@@ -124,10 +124,13 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
     )
 
 
-def test_a_file_of_another_version_is_set_aside_and_made_anew(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("statement", ["PRAGMA user_version = 99", "DROP TABLE part_column"])
+def test_a_file_of_another_version_or_without_a_table_is_set_aside_and_made_anew(
+    world: World, tmp_path: Path, statement: str
+) -> None:
     world.store.close()
     with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        base.execute("PRAGMA user_version = 99")
+        base.execute(statement)
     again = World.of(tmp_path)
     assert check_all(again) == 4 * 24
     assert again.fill() == 4
