@@ -31,7 +31,8 @@ def _bag(name: str, *topics: tuple[str, int, int], type_name: str = ODOM) -> Bag
         [
             TopicSummary(topic, type_name, "cdr", 2, first, last, latched=topic == "/tf_static")
             for topic, first, last in topics
-        ]
+        ],
+        silent=("/idle",),
     )
     return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
 
@@ -97,6 +98,7 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)
 
+    assert timeline.silent == ({"/idle"} if bags else set())
     assert timeline.transient_local == {topic.topic for _, topic in held if topic.latched}
     assert timeline.types == {
         name: tuple(sorted({topic.type for _, topic in held if topic.topic == name}))
