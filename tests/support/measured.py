@@ -76,10 +76,11 @@ FOREIGN: Final = (
     "omegaconf:OmegaConf.load",
     "pyiceberg.catalog.sql:SqlCatalog.create_table",
     "pyiceberg.catalog.sql:SqlCatalog.load_table",
-    "pyiceberg.table:Table.append",
-    "pyiceberg.table:Table.delete",
-    "pyiceberg.table:Table.overwrite",
     "pyiceberg.table:Table.refresh",
+    "pyiceberg.table:Transaction.append",
+    "pyiceberg.table:Transaction.commit_transaction",
+    "pyiceberg.table:Transaction.delete",
+    "pyiceberg.table:Transaction.overwrite",
     "yaml:safe_load",
 )
 """Functions of other projects that run many lines of their own: they are run untraced.

@@ -304,8 +304,9 @@ class LakeTables:
                 transaction.delete(condition)
             # A version lists the files that it deleted, with texts of their rows as bounds. The
             # next version does not have this list.
-            with _Transaction(table) as transaction:
-                transaction.append(table.schema().as_arrow().empty_table())
+            if _lists_deleted(table):
+                with _Transaction(table) as transaction:
+                    transaction.append(table.schema().as_arrow().empty_table())
 
         self._commit(name, "deleting from", write)
 
@@ -322,6 +323,13 @@ class LakeTables:
                         raise
                 else:
                     return
+
+
+def _lists_deleted(table: IcebergTable) -> bool:
+    """Returns whether the newest version of a table may list files that are not in it."""
+    newest = table.current_snapshot()
+    manifests = [] if newest is None else newest.manifests(table.io)
+    return any(manifest.deleted_files_count != 0 for manifest in manifests)
 
 
 def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:

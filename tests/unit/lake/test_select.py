@@ -25,8 +25,10 @@ from ros2_memory.lake.select import ALLOCATORS, Select, check_select
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, START_S, reply_of
-from tests.support.lakes import lake_in, lake_robots, ship_from, write_bag
+from tests.support.lakes import lake_in, lake_robots, selecting_here, ship_from, write_bag
 from tests.support.memories import memory_of
+
+__all__ = ["selecting_here"]
 
 HALL, ATTIC, UNSHIPPED = "hall", "attic", "cellar"
 ENDLESS = "WITH RECURSIVE t AS (SELECT 1 AS i UNION ALL SELECT i + 1 FROM t) SELECT max(i) FROM t"
@@ -70,6 +72,7 @@ def test_rows_of_all_robots_are_grouped_and_what_was_not_shipped_is_named(fleet:
     assert row == [START_S * 10**9, (START_S + 20) * 10**9]
 
 
+@pytest.mark.usefixtures("selecting_here")
 def test_a_call_sees_the_robots_that_it_names_and_may_ask_about(fleet: Fleet) -> None:
     assert asked(fleet, BAGS, robot=HALL)["rows"] == [[HALL, 3]]
     assert asked(fleet, BAGS, robot=f"{HALL}, {ATTIC}")["rows"] == [[ATTIC, 2], [HALL, 3]]
@@ -93,6 +96,7 @@ def test_rows_that_find_no_room_are_reported(fleet: Fleet) -> None:
     assert asked(fleet, "SELECT repeat('x', 90000)")["rows"] == []
 
 
+@pytest.mark.usefixtures("selecting_here")
 def test_values_that_json_has_not_are_texts_and_longer_texts_are_marked(fleet: Fleet) -> None:
     answer = asked(
         fleet,
@@ -186,6 +190,7 @@ def test_statements_of_all_forms_pass(select: str) -> None:
         check_select(select, TABLES, connection)
 
 
+@pytest.mark.usefixtures("selecting_here")
 def test_tables_are_joined_and_described(fleet: Fleet) -> None:
     join = "SELECT b.robot FROM Bags b JOIN channels c USING (robot, bag_id) GROUP BY ALL; -- all"
     assert len(asked(fleet, join)["rows"]) == 2
