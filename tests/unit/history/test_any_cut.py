@@ -382,7 +382,7 @@ def arrive(bag_dir: Path, splits: Splits, draw: Random) -> World:
     return world
 
 
-@settings(max_examples=24 if LONG else 2)
+@settings(max_examples=24 if LONG else 1)
 @given(seed=st.integers(0, 2**32), cuts=st.lists(st.floats(0, 1), max_size=4))
 @example(6671, [0.9375, 0.5, 0.03125, 0.25])  # A sighting goes on in another recording.
 def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[float]) -> None:
@@ -415,7 +415,7 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
 
 @patch.object(Scanner, "damaged_parts", lambda *_: [])  # Who fills knows of damage earlier.
 @patch.object(reverse_search, "MOST_UNSURE", 1)
-@settings(max_examples=60 if LONG else 2)
+@settings(max_examples=60 if LONG else 1)
 @given(seed=st.integers(0, 2**32))
 @example(17293)  # A topic of two types, in recordings side by side.
 @example(177)  # A chunk that is damaged.

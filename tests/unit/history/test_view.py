@@ -337,7 +337,7 @@ QUESTIONS: Final[Sequence[tuple[str, dict[str, Any]]]] = [
 ]
 
 
-@settings(max_examples=10 if LONG else 2)
+@settings(max_examples=10 if LONG else 1)
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 0.5]), has_types=st.booleans())
 @example(seed=12, part=1.0, has_types=False)
 @example(seed=35, part=0.5, has_types=False)

@@ -61,7 +61,7 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
 ]
 
 
-@settings(max_examples=60 if LONG else 2)
+@settings(max_examples=60 if LONG else 1)
 @given(
     kind=st.sampled_from(["odd", "moving map", "things"]),
     seed=st.integers(0, 2**32),

@@ -26,7 +26,7 @@ from tests.support.tables import table
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-EXAMPLES = 12 if LONG else 4
+EXAMPLES = 12 if LONG else 2
 THERE = {"x": 10.0, "y": 0.0, "radius_m": 1.0}
 
 
