@@ -4,6 +4,7 @@ import math
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.cli import plot
 from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.places.local_map import east_north
@@ -18,16 +20,14 @@ from tests.support.bags import battery, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of
 from tests.support.program import Program
 
-pytest.importorskip("matplotlib", reason="needs the extra plot")
-
-from matplotlib.figure import Figure
-
-from ros2_memory.cli import plot
-
 T0 = 1_700_000_000 * NS_PER_S
 S = NS_PER_S
 
-pytestmark = pytest.mark.usefixtures("no_deployment")
+# Not imported here: what it makes of the fonts takes each worker seconds.
+pytestmark = [
+    pytest.mark.usefixtures("no_deployment"),
+    pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs the extra plot"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -136,11 +136,11 @@ def test_a_picture_that_cannot_be_written_leaves_the_one_before(
     out = tmp_path / "path.svg"
     out.write_bytes(b"before")
 
-    def fill_the_disk(_: Figure, path: Path, **_options: object) -> None:
+    def fill_the_disk(_: object, path: Path, **_options: object) -> None:
         path.write_bytes(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Figure, "savefig", fill_the_disk)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fill_the_disk)
     refused = exits(2, f"plot path --out {out} {bags}")
     assert refused.err == f"ros2-memory plot path: {out}: No space left on device\n"
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"before"]

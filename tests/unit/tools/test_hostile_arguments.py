@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -81,18 +82,19 @@ def test_every_argument_stands_every_hostile_value(
 
 
 @pytest.mark.parametrize(
-    "given",
+    "given_",
     [
-        {f"x{n}": n for n in range(1_000_000)},
-        {"topic": [0] * 1_000_000},
-        {"topic": {"a": [[[0] * 4000] * 4]}},
-        {"topic": nested(DEEP)},
+        lambda: {f"x{n}": n for n in range(1_000_000)},
+        lambda: {"topic": [0] * 1_000_000},
+        lambda: {"topic": {"a": [[[0] * 4000] * 4]}},
+        lambda: {"topic": nested(DEEP)},
     ],
+    ids=["names", "numbers", "lists", "levels"],
 )
 def test_too_many_arguments_are_told_before_any_is_looked_at(
-    dispatcher: Dispatcher, given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    dispatcher: Dispatcher, given_: Callable[[], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Signature, "parse", lambda *_: pytest.fail("it was looked at"))
-    shown = held(asked(dispatcher, "find_last_match", given))
+    shown = held(asked(dispatcher, "find_last_match", given_()))
     assert shown["error"] == "invalid_arguments"
     assert re.search(r"^(topic|more than) .*(values|levels|arguments)", shown["detail"])
