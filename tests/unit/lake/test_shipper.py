@@ -21,12 +21,13 @@ from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.store import FILE
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import LakeError
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
-from tests.support.bags import detections, write_mcap
+from tests.support.bags import detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import LONG
 from tests.support.fakes import failing
@@ -176,6 +177,12 @@ def test_a_bag_of_which_messages_were_deleted_replaces_its_rows(tmp_path: Path) 
     assert [ship_from(tmp_path).bags for _ in range(2)] == [3, 0]
     assert values(tmp_path / "lake") == ["n0", "n100", "n101", "n200", "n201"]
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
+    # Nothing takes the place of all that was seen: these rows go, too.
+    for number in (0, 1):
+        said = text((START_S + 12 * number) * NS_PER_S, "hello")
+        write_mcap(tmp_path / "hall" / "rec" / f"rec_{number}.mcap", [said])
+    assert ship_from(tmp_path).bags == 2
+    assert lake_column(tmp_path / "lake", "sightings", "label") == ["cup"]
 
 
 @pytest.mark.parametrize("first", [0, 1])
