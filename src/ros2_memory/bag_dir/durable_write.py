@@ -7,13 +7,15 @@ No symbolic link is followed, so all files lie in the bag directory itself.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
-from contextlib import suppress
+import time
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
 MAX_SMALL_FILE: Final = 1 << 20
@@ -21,8 +23,10 @@ MAX_SMALL_FILE: Final = 1 << 20
 # O_NONBLOCK: opening a FIFO would wait for its other end.
 _COMMON: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _REPLACE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _COMMON
-_APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CREAT | _COMMON
+_APPEND: Final = os.O_RDWR | os.O_APPEND | _COMMON
 _READ: Final = os.O_RDONLY | _COMMON
+_LOCK_WAIT_S: Final = 2.0
+_POLL_S: Final = 0.01
 
 
 def write_durably(target: Path, text: str, *, mode: int | None = None) -> None:
@@ -71,16 +75,37 @@ def append_durably(target: Path, text: str) -> None:
     Raises:
         OSError: the lines cannot be written, and none is appended.
     """
-    descriptor = os.open(target, _APPEND, 0o666)
-    try:
+    with locked(target, os.O_CREAT) as descriptor:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file", str(target))
         append_lines(descriptor, text)
-    finally:
-        os.close(descriptor)
     if not status.st_size:
         flush(target.parent)
+
+
+@contextmanager
+def locked(path: Path, flags: int = 0) -> Iterator[int]:
+    """Yields a descriptor of a file, for reading and appending. Other writers wait meanwhile.
+
+    Raises:
+        OSError: the file cannot be opened, or another writer holds the lock for long.
+    """
+    give_up = time.monotonic() + _LOCK_WAIT_S
+    while True:
+        descriptor = os.open(path, _APPEND | flags, 0o666)
+        try:
+            with suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Another writer may have replaced the file before this one locked it.
+                if is_open_file(path, descriptor):
+                    yield descriptor
+                    return
+        finally:
+            os.close(descriptor)
+        if time.monotonic() >= give_up:
+            raise BlockingIOError(f"another program has locked {path}")
+        time.sleep(_POLL_S)
 
 
 def append_lines(descriptor: int, text: str) -> None:

@@ -35,6 +35,7 @@ from ros2_memory.bag_dir.durable_write import (
     MAX_SMALL_FILE,
     append_durably,
     flush,
+    locked,
     open_plain,
     read_small_file,
     write_durably,
@@ -178,8 +179,18 @@ class JsonLog(Generic[_T]):
         give_to_owner(target, bag_dir)
         return target.stat().st_size
 
+    def rewrite(self, bag_dir: Path, changed: Callable[[list[_T]], Iterable[_T]]) -> None:
+        """Replaces the rows by what `changed` returns of them. Who appends waits meanwhile.
+
+        Raises:
+            OSError: the file cannot be read or written; the old one remains.
+            ValueError: it is not a regular file.
+        """
+        with locked(bag_dir / self.name):
+            self.replace(bag_dir, changed(self.rows(bag_dir)))
+
     def replace(self, bag_dir: Path, rows: Iterable[_T]) -> None:
-        """Replaces all rows.
+        """Replaces all rows, of a log that has one writer.
 
         Raises:
             OSError: the file cannot be written; the old one remains.

@@ -18,13 +18,11 @@ that have gone, the list is written again without them.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import stat
 import threading
-import time
 from bisect import bisect_left
-from contextlib import contextmanager, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -34,7 +32,7 @@ from pydantic import AfterValidator, StrictBool
 from ros2_memory.bag_dir.durable_write import (
     append_lines,
     flush,
-    is_open_file,
+    locked,
     write_durably,
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
@@ -73,9 +71,6 @@ if TYPE_CHECKING:
 
 _SPARE_LINES: Final = 1000
 _MAX_NAMED: Final = 5
-_LOCK_WAIT_S: Final = 2.0
-_POLL_S: Final = 0.01
-_APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 _log = get_logger(__name__)
 
@@ -500,9 +495,7 @@ class OwnRecordings:
             raise self._failure(error) from error
 
     def _append_lines(self, rows: Sequence[ListRow]) -> None:
-        with self._locked() as descriptor:
-            if descriptor is None:
-                raise FileNotFoundError("the list of recordings is missing")
+        with locked(self._path) as descriptor:
             append_lines(descriptor, LIST.text(rows))
         self._add(rows)
 
@@ -510,11 +503,10 @@ class OwnRecordings:
         """Replaces the list by one with these lines, and without recordings that are gone."""
         before = self._rows
         try:
-            with self._locked() as descriptor:
-                if descriptor is not None:
-                    # Another program may have appended meanwhile.
-                    self._stamp = None
-                    self._read_if_changed()
+            with locked(self._path) if os.path.lexists(self._path) else nullcontext():
+                # Another program may have appended meanwhile.
+                self._stamp = None
+                self._read_if_changed()
                 # A line that announces a recording must not replace the one with its directory.
                 merged = before | {
                     name: row
@@ -541,33 +533,6 @@ class OwnRecordings:
             flush(folder.parent)
         write_durably(self._path, LIST.text(rows))
         give_to_owner(self._path, self._bag_dir)
-
-    @contextmanager
-    def _locked(self) -> Iterator[int | None]:
-        """Yields a descriptor of the locked list; None if there is no list.
-
-        Raises:
-            OSError: the list cannot be opened, or another program holds the lock.
-        """
-        give_up = time.monotonic() + _LOCK_WAIT_S
-        while True:
-            try:
-                descriptor = os.open(self._path, _APPEND)
-            except FileNotFoundError:
-                yield None
-                return
-            try:
-                with suppress(BlockingIOError):
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    # Another program may have replaced the file before this one locked it.
-                    if is_open_file(self._path, descriptor):
-                        yield descriptor
-                        return
-            finally:
-                os.close(descriptor)
-            if time.monotonic() >= give_up:
-                raise BlockingIOError(f"another program has locked {self._path}")
-            time.sleep(_POLL_S)
 
     def _failure(self, error: OSError, verb: str = "written") -> RecorderError:
         return RecorderError(

@@ -24,6 +24,7 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from itertools import chain
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
@@ -86,7 +87,7 @@ RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)
 # lost.jsonl
 
 MOST_LOST_BYTES: Final = 1 << 20
-"""A longer file loses its older half, unless joining its rows makes it half as long."""
+"""A longer file is shortened."""
 EVERY_TOPIC: Final = "*"
 """Stands for all topics of a recording that ended unexpectedly."""
 INTERRUPTIONS: Final = MappingProxyType(
@@ -123,24 +124,33 @@ class Loss:
     by: Literal["counter", "stamps", "rosbag2", "refused", "forgotten", "expired"] | Interruption
 
 
-LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)
+LOST: Final = JsonLog(LOST_FILE, Loss)
 
 
 def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
-    """Appends losses. In a file that is too long, rows are joined, or the oldest dropped.
+    """Appends losses. A file that is too long is shortened, see `_shortened`.
 
     Raises:
         OSError: the losses cannot be written, and none is appended.
     """
     if LOST.append(bag_dir, losses) > MOST_LOST_BYTES:
         with suppress(OSError):  # the next call tries again
-            rows = LOST.rows(bag_dir)
-            # A refused publisher has a row for each split.
-            refused = _joined(row for row in rows if row.by == "refused")
-            rows = [*refused, *(row for row in rows if row.by != "refused")]
-            if len(LOST.text(rows)) > MOST_LOST_BYTES // 2:
-                rows = rows[len(rows) // 2 :]
-            LOST.replace(bag_dir, rows)
+            LOST.rewrite(bag_dir, _shortened)
+
+
+def _shortened(losses: Sequence[Loss]) -> Sequence[Loss]:
+    """Returns losses without the older half, unless joining rows is enough.
+
+    What was forgotten stays as it is: without its row, "never" would be answered of its time.
+    """
+    forgotten = [loss for loss in losses if loss.by == "forgotten"]
+    # A refused publisher has a row for each split.
+    refused = _joined(loss for loss in losses if loss.by == "refused")
+    others = [loss for loss in losses if loss.by not in {"forgotten", "refused"}]
+    others = sorted([*refused, *others], key=attrgetter("stop"))
+    if len(LOST.text(others)) > MOST_LOST_BYTES // 2:
+        others = others[len(others) // 2 :]
+    return [*forgotten, *others]
 
 
 def _joined(losses: Iterable[Loss]) -> list[Loss]:
@@ -240,41 +250,43 @@ def deleted_of(recording: str, splits: Iterable[tuple[str, Ns, Ns]]) -> Deleted:
 def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """Appends splits that are about to be deleted.
 
-    A file that is too long is written again, with one row for each recording that still exists, and
-    one for all others, whose files nothing lists any more. If the file cannot be read, the next
-    call tries again.
+    A file that is too long is shortened, see `_without_gone`.
 
     Raises:
         OSError: the file cannot be written.
     """
-    if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
-        return
-    known = _deleted_by_recording(bag_dir)
-    if known is None:
-        return
+    if DELETED.append(bag_dir, deleted) > _MOST_DELETED_BYTES:
+        with suppress(OSError):  # the next call tries again
+            DELETED.rewrite(bag_dir, partial(_without_gone, bag_dir))
+
+
+def _without_gone(bag_dir: Path, rows: Iterable[Deleted]) -> list[Deleted]:
+    """Returns one row for each recording that still exists, and one for all others.
+
+    Nothing lists the files of recordings that are gone any more.
+    """
     present: list[Deleted] = []
     gone: list[Span] = []
-    for name, row in known.items():
+    for name, row in _by_recording(rows).items():
         if name and (bag_dir / name).is_dir():
             present.append(row)
         else:
             gone += row.spans
-    rows = [Deleted("", spans=tuple(united(gone, _TOUCHING_NS)[-_MOST_SPANS:]))]
+    left = [Deleted("", spans=tuple(united(gone, _TOUCHING_NS)[-_MOST_SPANS:]))]
     # The newest recordings come last, and stay longest.
     size = 0
     for row in reversed(present):
         size += len(DELETED.text([row]))
         if size > _MOST_DELETED_BYTES // 2:
             break
-        rows.append(row)
-    DELETED.replace(bag_dir, rows)
+        left.append(row)
+    return left
 
 
-@until_changed(DELETED_FILE)
-def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
+def _by_recording(rows: Iterable[Deleted]) -> Mapping[str, Deleted]:
     files: defaultdict[str, dict[str, None]] = defaultdict(dict)
     spans: defaultdict[str, list[Span]] = defaultdict(list)
-    for row in DELETED.rows(bag_dir):
+    for row in rows:
         files[row.recording] |= dict.fromkeys(row.files)
         spans[row.recording] += row.spans
     by_recording: dict[str, Deleted] = {}
@@ -282,6 +294,11 @@ def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
         joined = united(spans[name], _APART_NS if name else _TOUCHING_NS)
         by_recording[name] = Deleted(name, tuple(names_of_files), tuple(joined))
     return by_recording
+
+
+@until_changed(DELETED_FILE)
+def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
+    return _by_recording(DELETED.rows(bag_dir))
 
 
 def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
@@ -446,11 +463,15 @@ def append_receipts(bag_dir: Path, receipts: Iterable[Receipt]) -> None:
     """
     SHIPPED.append(bag_dir, receipts)
     rows = SHIPPED.rows(bag_dir)
-    if len(rows) > _SPARE_RECEIPTS:
-        newest = {receipt.bag: receipt for receipt in rows}
-        present = [receipt for path, receipt in newest.items() if (bag_dir / path).exists()]
-        if len(rows) > _SPARE_RECEIPTS + 2 * len(present):
-            SHIPPED.replace(bag_dir, present)
+    most = len(rows) - _SPARE_RECEIPTS
+    if most > 0 and most > 2 * len(_present(bag_dir, rows)):
+        SHIPPED.rewrite(bag_dir, partial(_present, bag_dir))
+
+
+def _present(bag_dir: Path, receipts: Iterable[Receipt]) -> list[Receipt]:
+    """Returns the newest receipt of each bag that exists."""
+    newest = {receipt.bag: receipt for receipt in receipts}
+    return [receipt for path, receipt in newest.items() if (bag_dir / path).exists()]
 
 
 # Sizes alone: a week has 60,000 bags.

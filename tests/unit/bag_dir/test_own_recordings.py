@@ -12,6 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir import own_recordings
+from ros2_memory.bag_dir.durable_write import locked
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import LIST_FILE
@@ -173,16 +174,16 @@ def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
     (tmp_path / "old").mkdir()
     old = identity_of(tmp_path / "old")
     assert old
-    locked = OwnRecordings._locked
 
-    def adopting_first(self: OwnRecordings) -> AbstractContextManager[int | None]:
-        if self is own:  # another program has the lock, so this one waits
-            OwnRecordings(tmp_path).adopt({"old": old})
-            patch.setattr(own_recordings, "write_durably", failing())
-        return locked(self)
+    def adopting_first(path: Path) -> AbstractContextManager[int]:
+        patch.setattr(own_recordings, "locked", locked)
+        # Another program has the lock, so this one waits.
+        OwnRecordings(tmp_path).adopt({"old": old})
+        patch.setattr(own_recordings, "write_durably", failing())
+        return locked(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(OwnRecordings, "_locked", adopting_first)
+        patch.setattr(own_recordings, "locked", adopting_first)
         with pytest.raises(RecorderError, match="No space left"):
             own.begin(B)
     assert own.owns(tmp_path / "old")

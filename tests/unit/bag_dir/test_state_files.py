@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -343,6 +344,31 @@ def test_a_publisher_that_is_refused_all_day_hides_nothing_older(
     assert [loss for loss in losses if loss.by != "refused"] == [forgotten]
     refused = ((loss.start, loss.stop) for loss in losses if loss.by == "refused")
     assert united(refused) == [(T0, spans[-1][1])]
+
+
+def test_losses_that_are_dropped_are_the_oldest_and_none_that_were_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forgotten = [Loss("/chatter", T0 + n, T0 + n + 1, 5, "forgotten") for n in range(3)]
+    append_losses(tmp_path, forgotten)
+    refused = Loss("/camera", T0 + 10**12, T0 + 2 * 10**12, 0, "refused")
+    append_losses(tmp_path, [refused])
+    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 6000)
+    for n in range(3):
+        append_losses(tmp_path, [Loss("/odom", T0 - n, T0, 1, "counter")] * 100)
+    losses = read_losses(tmp_path, 0, 2 * T0)
+    assert len(losses) < 100
+    assert [loss for loss in losses if loss.by != "counter"] == [*forgotten, refused]
+
+
+def test_rows_that_one_program_appends_while_another_shortens_the_file_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 100)
+    losses = [Loss("/chatter", T0 + n, T0 + n + 1, 1, "forgotten") for n in range(80)]
+    with ThreadPoolExecutor(2) as pool:
+        [*pool.map(lambda loss: append_losses(tmp_path, [loss]), losses)]
+    assert {*read_losses(tmp_path, 0, 2 * T0)} == {*losses}
 
 
 def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(
