@@ -15,7 +15,6 @@ from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord
-from ros2_memory.core.directories import identity_of
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.rules import Rule, SplitSearch
@@ -125,9 +124,9 @@ class WatchedBags:
         path = self.bag_dir / recording / f"{recording}_{self._splits}.mcap"
         self._splits += 1
         written = write_mcap(path, messages, **layout)
-        identity = identity_of(path.parent)
-        assert identity is not None
-        self.own.adopt({recording: identity})
+        if not self.own.owns(path.parent):
+            self.own.complete(recording)
+        self.own.note_splits(recording, {split.name for split in path.parent.iterdir()})
         return written
 
     def hand_over(self, old: str, new: str, cut: int, last_of_old: str) -> None:

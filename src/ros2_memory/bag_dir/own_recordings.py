@@ -182,12 +182,16 @@ class OwnRecordings:
         return [name for name in self._current_rows() if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
-        """Returns the listed recordings in the order in which they began, without adopted ones.
+        """Returns the recordings that the recorder made, in the order in which they began.
+
+        Bags that were put into one of them may be adopted.
 
         Raises:
             OSError: the list cannot be read.
         """
-        return [name for name, row in self._current_rows().items() if not row.adopted]
+        rows = self._current_rows().items()
+        made = (name for name, row in rows if not row.adopted or row.splits is not None)
+        return [name for name in made if not is_kept_apart(name)]
 
     def owns_bag(self, path: Path) -> bool:
         """Whether a bag file is the recorder's own, see `judge`.

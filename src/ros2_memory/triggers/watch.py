@@ -179,7 +179,7 @@ class Triggers:
     def _new_state(self, snapshot: Snapshot) -> TriggerState:
         """Returns a state in which all closed bags are searched."""
         closed, live = self._closed_bags(snapshot, TriggerState())
-        ended = [name for name in self.own.names() if name not in live]
+        ended = [name for name in self.own.in_order() if name not in live]
         newest = {name: max(bag.end for bag in bags) for name, bags in closed.items()}
         searched = {name: end + 1 for name, end in newest.items() if name in live}
         return TriggerState(before=ended[-1] if ended else None, searched=searched)
@@ -205,7 +205,7 @@ class Triggers:
         """
         active = (self.own.name_of(aside.path.parent) for aside in snapshot.active)
         live = frozenset((*read_heartbeat(self.bag_dir).recordings, *active))
-        names = [*self.own.names()]
+        names = self.own.in_order()
         if state.before in names:
             first = names.index(state.before) + 1
         else:

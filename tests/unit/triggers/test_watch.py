@@ -12,9 +12,10 @@ from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
+from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.triggers.rules import Rule
-from tests.support.bags import McapLayout, Msg, text
+from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.fakes import broken
 from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
@@ -71,6 +72,21 @@ def test_a_rule_begins_with_what_is_recorded_from_now_on(robot: WatchedBags) -> 
     robot.split(seconds(20, 30, {26}))
     robot.close_all()
     assert robot.spans() == [(21, 29)]
+
+
+def test_adopted_bags_fire_nothing_and_the_recording_beside_them_does(robot: WatchedBags) -> None:
+    live = robot.begin(T0)
+    robot.split(seconds(0, 10))
+    write_mcap(robot.bag_dir / live / "copy.mcap", [])
+    write_mcap(robot.bag_dir / "old" / "old_0.mcap", seconds(-90_000, -89_990, {-89_995}))
+    for name in (live, "old"):
+        identity = identity_of(robot.bag_dir / name)
+        assert identity
+        robot.own.adopt({name: identity})
+    robot.look()
+    robot.split(seconds(10, 20, {15}))
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 15 * S]
 
 
 def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
