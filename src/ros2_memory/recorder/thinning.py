@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.detections import DetectionColumns
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import Field, IntArray
 
     Name = tuple[str, int]  # a label or frame, and its number in the message
     Points = NDArray[np.float64]
@@ -427,8 +427,17 @@ def has_samples(table: Table) -> bool:
     return any(
         not isinstance(column, Texts) and column.size and column.max() > _LONG
         for path, column in table.columns.items()
-        if path.endswith(".length") and "covariance" not in path
+        if "covariance" not in path and _is_of_lengths(table, path)
     )
+
+
+def _is_of_lengths(table: Table, path: str) -> bool:
+    """Whether a column has the lengths of arrays, and not a field of that name."""
+    array = path.removesuffix(".length")
+    if array == path:
+        return False
+    around = _field_at(table, array)
+    return around is None or around.length is not None
 
 
 def _stepped(score: float) -> Scored:
@@ -474,10 +483,14 @@ def _covering_rows(
 
 
 def _is_time(table: Table, path: str) -> bool:
+    found = _field_at(table, path)
+    return found is not None and isinstance(found.kind, Definition) and is_time(found.kind)
+
+
+def _field_at(table: Table, path: str) -> Field | None:
     names = path.split(".")
     along = fields_at(table.definition, names)
-    kind = along[-1].kind if len(along) == len(names) else ""
-    return isinstance(kind, Definition) and is_time(kind)
+    return along[-1] if len(along) == len(names) else None
 
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
+from rosbags.typesys import get_types_from_msg
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -58,6 +59,7 @@ from tests.support.bags import (
     text,
     tf,
     transform,
+    typestore,
     write_mcap,
 )
 from tests.support.clocks import SettableClock
@@ -683,6 +685,16 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
     assert {*topics_in(bag_dir)} == {"/drive/_action/status"}
     assert found >= {10.0, 10.5}
     assert len(found) < 20
+
+
+def test_a_field_that_is_called_length_makes_no_array(bag_dir: Path) -> None:
+    size, parcel = "my_msgs/msg/Size", "my_msgs/msg/Parcel"
+    typestore().register(get_types_from_msg("float64 length\n", size))
+    typestore().register(get_types_from_msg("Size size\n", parcel))
+    said = make(parcel, size=make(size, length=400.0))
+    record(bag_dir, [Msg("/parcel", parcel, T0 + n * S, said) for n in range(10)])
+    keep_all(bag_dir)
+    assert {*topics_in(bag_dir)} == {"/parcel"}
 
 
 def test_numbers_too_large_to_be_rounded_stay_as_they_are(bag_dir: Path) -> None:
