@@ -218,7 +218,8 @@ class LossCounter:
                 if hole.is_open and not is_over:
                     settled = series.positions.index(hole.before)
                     break
-                start, stop = hole.before.log_time, hole.after.log_time
+                # The clock may have been set back between them.
+                start, stop = sorted((hole.before.log_time, hole.after.log_time))
                 losses.append(Loss(topic, start, stop, hole.missing, series.kind))
             series.positions = series.positions[settled:]
         self._lately += losses

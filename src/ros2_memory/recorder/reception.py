@@ -428,6 +428,7 @@ class Reception:
         if recording.span is not None:
             # rosbag2 reports a publisher late: the loss begins before the split.
             first, last = recording.span
+            first = min(first, start)  # the clock was set back
             since = max(first, min(last, start) - _UNNOTICED_NS)
         for topic in sorted(recording.refused):
             self._unwritten.append(Loss(topic, since, end + 1, 0, "refused"))

@@ -174,6 +174,22 @@ def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_p
     assert read_losses(tmp_path, MIN_NS, MAX_NS) == [Loss("/odom", T0, last + 1, 0, "refused")]
 
 
+def test_what_a_refused_publisher_sent_is_missing_after_the_clock_was_set_back(
+    tmp_path: Path,
+) -> None:
+    made = reception(tmp_path)
+    made.overrides("a")
+    made.note_refused("a", "/odom")
+    for number, begin in enumerate((0, 10, -40, -30)):
+        at = T0 + begin * NS
+        messages = [odom(at + n * NS, 1.0, 2.0) for n in range(10)]
+        made.learn("a", write_mcap(tmp_path / f"a_{number}.mcap", messages))
+    made.flush()
+    before = read_losses(tmp_path, T0 - 40 * NS, T0 - 22 * NS)
+    assert [loss.topic for loss in before] == ["/odom", "/odom"]
+    assert all(loss.start < loss.stop for loss in read_losses(tmp_path, MIN_NS, MAX_NS))
+
+
 def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
