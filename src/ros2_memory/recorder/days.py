@@ -230,14 +230,14 @@ class MemoryDays:
         """
         today = ""
         if now is not None:
-            today = memory_file(utc_day(now))
-            oldest = memory_file(utc_day(now - self._limits.max_age_ns))
+            today = utc_day(now)
+            oldest = utc_day(now - self._limits.max_age_ns)
             for path in self._days():
-                if _FIRST_DAY <= path.name < oldest:
+                if _FIRST_DAY <= _day_of(path) < oldest:
                     self._delete_day(path)
         # Days after today come from a clock that was ahead. They go first: they would push out all
         # others, and never age.
-        days = sorted(self._days(), key=lambda path: "" < today < path.name, reverse=True)
+        days = sorted(self._days(), key=lambda path: "" < today < _day_of(path), reverse=True)
         size = sum(path.stat().st_size for path in days)
         for path in days:
             if size <= self._limits.max_bytes:
@@ -246,12 +246,12 @@ class MemoryDays:
             self._delete_day(path)
         self._forget_deleted()
         if now is not None:
-            self._thin_one_before(memory_file(utc_day(now - MONTH_NS)))
+            self._thin_one_before(utc_day(now - MONTH_NS))
 
     def _thin_one_before(self, newest: str) -> None:
-        """Thins the oldest day that is not thinned to minutes yet; its file sorts before a name."""
+        """Thins the oldest day before another one (`20261120`) that is not thinned to minutes."""
         for path in self._days():
-            if path.name < newest and path not in self._checked_for_minutes:
+            if _day_of(path) < newest and path not in self._checked_for_minutes:
                 self._checked_for_minutes.add(path)
                 channels = self.reader.channels(path)
                 is_thinned = all(_BY_MINUTE in channel.metadata for channel in channels)
@@ -268,7 +268,7 @@ class MemoryDays:
         if not days:
             THINNED.remove(self.bag_dir)
             return
-        left = thinned.from_day(days[0].name[:8])  # as `utc_day` returns it
+        left = thinned.from_day(_day_of(days[0]))
         if left != thinned:
             THINNED.write(self.bag_dir, left)
 
@@ -341,7 +341,9 @@ class MemoryDays:
         if self._folder.is_symlink() or not self._folder.is_dir():
             return []
         paths = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
-        return sorted(path for path in paths if self.own.owns_bag(path))
+        own = (path for path in paths if self.own.owns_bag(path))
+        # The numbered files of a day, whose names are longer, are newer than its first one.
+        return sorted(own, key=lambda path: (_day_of(path), len(path.name), path))
 
     def _read_thinned(self) -> Thinned:
         """Returns the content of `thinned.json`; an empty one if the file is missing or damaged."""
@@ -602,6 +604,11 @@ class _StayingMessages:
     left_out: dict[str, str] = field(default_factory=dict)
     unwritten: Counter[str] = field(default_factory=Counter)
     reasons: dict[str, str] = field(default_factory=dict)
+
+
+def _day_of(path: Path) -> str:
+    """Returns the day of a file, as `utc_day`."""
+    return path.name[:8]
 
 
 def _words_in(name: str) -> str:

@@ -35,7 +35,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S, Clock
 from ros2_memory.recorder import days as recorder_days
 from ros2_memory.recorder.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.recorder.housekeeping import Housekeeping
@@ -272,6 +272,21 @@ def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(bag
     keep_all(bag_dir)
     assert (bag_dir / DAY_FILE).read_bytes() == b"\x89MCAP0\r\nbroken"
     assert messages_in(bag_dir / "memory/20260921-1.thinned.mcap")
+
+
+def test_each_file_of_a_day_ages_with_the_day(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    keep_all(bag_dir)
+    damaged = (bag_dir / DAY_FILE).read_bytes()[:-100]
+    (bag_dir / DAY_FILE).write_bytes(damaged)
+    split(bag_dir, 600, name="rec_B")
+    keep_all(bag_dir, "rec_B")
+    both = ["20260921-1.thinned.mcap", "20260921.thinned.mcap"]
+    days = days_of(bag_dir, limits=MemoryLimits(max_age_ns=10 * NS_PER_DAY))
+    days.limit(T0 + 10 * NS_PER_DAY)
+    assert days_in(bag_dir) == both
+    days.limit(T0 + 11 * NS_PER_DAY)
+    assert days_in(bag_dir) == []
 
 
 def drive_and_stand(bag_dir: Path, name: str, start: int) -> Path:
