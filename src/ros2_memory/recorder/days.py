@@ -173,6 +173,7 @@ class MemoryDays:
         words = [_words_in(name) for name in self._limits.people]
         self._people = [name for name in words if name.strip()]
         self._checked_for_minutes: set[Path] = set()
+        self._left_unthinned: set[Path] = set()
         self._failing = FailingFiles(self.monotonic)
         self._counted_at_s: float | None = None
 
@@ -257,8 +258,12 @@ class MemoryDays:
                 is_thinned = all(_BY_MINUTE in channel.metadata for channel in channels)
                 # A damaged day that is rewritten would not show any more that messages are missing.
                 if not is_thinned and self._is_whole(path):
+                    self._left_unthinned.add(path)
                     self._thin_to_minutes(path)
-                    break
+                    self._left_unthinned.remove(path)
+                    return
+        # Nothing else is left to thin: where the disk was full, there may be room now.
+        self._checked_for_minutes -= self._left_unthinned
 
     def _forget_deleted(self) -> None:
         """Drops from `thinned.json` what is older than all days; deletes it with the last day."""

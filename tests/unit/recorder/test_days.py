@@ -792,6 +792,19 @@ def test_after_a_month_numbers_have_one_message_a_minute_once_and_again_with_wha
     assert after[battery_only] < topics_in(bag_dir)[battery_only] < before[battery_only]
 
 
+def test_a_day_that_a_full_disk_left_as_it_was_is_thinned_when_there_is_room(bag_dir: Path) -> None:
+    splits(bag_dir, range(5))
+    keep_all(bag_dir)
+    whole, writer, now = topics_in(bag_dir), Failing(0), T0 + MONTH_NS + 2 * NS_PER_DAY
+    days = days_of(bag_dir, writer=writer)
+    with pytest.raises(BagError, match="No space left"):
+        days.limit(now)
+    writer.left = 10**9
+    for _ in range(2):
+        days.limit(now)
+    assert topics_in(bag_dir)["/battery_state"] < whole["/battery_state"]
+
+
 def test_where_a_day_cannot_be_written_the_limits_take_the_oldest_and_age_waits_for_a_day(
     bag_dir: Path,
 ) -> None:
