@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 import time
 from collections import Counter
 from contextlib import contextmanager
@@ -140,7 +141,7 @@ def _remove_arguments(record: logging.LogRecord) -> bool:
 
 
 class LogThrottle:
-    """Counts events by kind, so that each kind is logged once in `every_s` at most.
+    """Counts events by kind, so that each kind is logged once in `every_s` at most. Thread-safe.
 
     Args:
         monotonic: a clock that never steps, in seconds.
@@ -154,19 +155,22 @@ class LogThrottle:
         self._every_s = every_s
         self._counts: Counter[Hashable] = Counter()
         self._silent_until: dict[Hashable, float] = {}
+        # Garbage that is collected meanwhile may log in the same thread.
+        self._lock = threading.RLock()
 
     def count(self, kind: Hashable) -> int:
         """Counts an event; returns how many are to be logged as one, or 0 if none is now."""
-        self._counts[kind] += 1
-        now = self._monotonic()
-        if now < self._silent_until.get(kind, now):
-            return 0
-        count = self._counts.pop(kind)
-        if len(self._silent_until) >= _MAX_KINDS:
-            self._silent_until.clear()
-            self._counts.clear()
-        self._silent_until[kind] = now + self._every_s
-        return count
+        with self._lock:
+            self._counts[kind] += 1
+            now = self._monotonic()
+            if now < self._silent_until.get(kind, now):
+                return 0
+            count = self._counts.pop(kind)
+            if len(self._silent_until) >= _MAX_KINDS:
+                self._silent_until.clear()
+                self._counts.clear()
+            self._silent_until[kind] = now + self._every_s
+            return count
 
 
 class _LibraryFilter(logging.Filter):

@@ -4,6 +4,9 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from threading import Barrier, BrokenBarrierError
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -12,7 +15,11 @@ import structlog
 from mcp.server import streamable_http as transport
 
 from ros2_memory.core import logging_setup
-from ros2_memory.core.logging_setup import configure_logging, get_logger
+from ros2_memory.core.logging_setup import (
+    LogThrottle,
+    configure_logging,
+    get_logger,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -95,3 +102,17 @@ def test_without_arguments_the_library_shows_nothing_of_a_message(
     logged = events(capsys)
     assert [each["level"] for each in logged] == ["warning", "error"]
     assert "s3cret" not in str(logged)
+
+
+def test_an_event_of_each_of_two_threads_is_counted_once() -> None:
+    """Whether or not both are at the clock at once."""
+    both = Barrier(2)
+
+    def now() -> float:
+        with suppress(BrokenBarrierError):
+            both.wait(timeout=0.5)
+        return 0.0
+
+    throttle = LogThrottle(now, every_s=0.0)
+    with ThreadPoolExecutor(2) as pool:
+        assert sum(pool.map(throttle.count, ["refused", "refused"])) == 2
