@@ -38,7 +38,7 @@ def paths_named(path: str) -> re.Pattern[str]:
     `run_0.mcap`, `run_1.mcap`).
     """
     suffixes = "|".join(map(re.escape, BAG_KINDS))
-    return re.compile(rf"{re.escape(path)}(?:/.*|(?:_\d+)?(?:{suffixes}))?")
+    return re.compile(rf"{re.escape(path)}(?:/.*|(?:_\d+)?(?:{suffixes}))?", re.DOTALL)
 
 
 def recordings_of(

@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 REPAIR_SUFFIX: Final = ".repair"
-_LEFTOVER: Final = re.compile(r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape(REPAIR_SUFFIX))
+_LEFTOVER: Final = re.compile(
+    r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape(REPAIR_SUFFIX), re.DOTALL
+)
 _JOURNALS: Final = ("-wal", "-shm", "-journal")
-_JOURNAL: Final = re.compile(rf".+\.db3({'|'.join(_JOURNALS)})", re.IGNORECASE)
+_JOURNAL: Final = re.compile(rf".+\.db3({'|'.join(_JOURNALS)})", re.IGNORECASE | re.DOTALL)
 
 
 def repair_name(name: str) -> str:

@@ -46,12 +46,16 @@ def test_a_recording_that_is_not_there_is_named_as_it_was_asked_for(tmp_path: Pa
     assert index_of(tmp_path, "b").refresh().problem == "no bag is named b (data.recording)"
 
 
-@pytest.mark.parametrize("name", ["a", "a_1", "run", "run_1", "deep", "deep/b", "loose", "nothing"])
+@pytest.mark.parametrize(
+    "name", ["a", "a_1", "run", "run_1", "deep", "deep/b", "broken", "loose", "nothing"]
+)
 def test_the_index_of_one_recording_finds_what_a_scan_of_it_finds(
     tmp_path: Path, name: str
 ) -> None:
     bags = ["a/a_0", "a/a_1", "a_1/0", "run_0", "run_1", "run_10", "loose", "loose_x"]
-    for n, bag in enumerate([*bags, "deep/b/0", "deep/c/0", "latched/carried"]):
+    for n, bag in enumerate(
+        [*bags, "deep/b/0", "deep/c/0", "latched/carried", "broken/broken_\n0"]
+    ):
         write(tmp_path, bag, at_s=n)
     for folder in ("a", "deep/b"):
         (tmp_path / folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")

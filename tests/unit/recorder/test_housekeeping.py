@@ -163,7 +163,7 @@ def test_a_bag_goes_with_its_unfinished_compressed_form_and_with_its_journals(
     plain, base = bag(tmp_path / "a/a_0.mcap", 0), write_db3(tmp_path / "a/a_0.db3", messages)
     packed = zstandard.compress(plain.read_bytes())
     plain.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
-    for journal in ("a_0.db3-shm", "a_1.db3-shm"):
+    for journal in ("a_0.db3-shm", "a_1.db3-shm", "a\n.db3-wal", ".a\n.mcap.repair"):
         base.with_name(journal).write_bytes(b"")
     bag(tmp_path / "b/b_0.mcap", 100)
     keeper_of(tmp_path, max_bytes=1, reader=Rosbag2Reader()).apply()
