@@ -802,7 +802,8 @@ class TriggerState:
 
     Attributes:
         rules: by name; rules that are not configured any more are dropped.
-        searched: the log time (excluded) up to which each of the newest recordings was searched.
+        searched: the log time (excluded) up to which each part of the newest recordings was
+            searched; see `triggers.rules.parts_of`.
         before: the newest recording that needs no search any more; None if there is none.
     """
 

@@ -32,13 +32,21 @@ from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+from ros2_memory.core.model import COMPRESSED, BagFile, JsonValue, TimeWindow
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
+    from collections.abc import (
+        Callable,
+        Collection,
+        Iterable,
+        Iterator,
+        Mapping,
+        MutableMapping,
+        Sequence,
+    )
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import SchemaExtractor
@@ -155,9 +163,9 @@ class Rule:
 
 
 class SearchPart(NamedTuple):
-    """A part of one recording that can be searched: its closed bags that touch a window."""
+    """A part of a recording (see `parts_of`) that can be searched: bags that touch a window."""
 
-    recording: str
+    name: str
     window: TimeWindow
     bags: tuple[BagFile, ...]
 
@@ -183,6 +191,47 @@ class SearchChain(NamedTuple):
     goes_on: bool
 
 
+def parts_of(
+    recording: str, bags: Iterable[BagFile], searched: Mapping[str, Ns]
+) -> dict[str, list[BagFile]]:
+    """Returns the splits among the closed bags of a recording, by part.
+
+    A part is searched in order of time. Another one (`rec_A#7`, by its first split) begins where
+    the clock was set back, and behind a split that cannot be read: that may still come. `searched`
+    has until which log time each part was searched.
+    """
+    splits: dict[int, BagFile] = {}
+    for bag in bags:
+        stem = bag.file.removesuffix(COMPRESSED).removesuffix(".mcap")
+        number = stem.rpartition(f"/{recording}_")[2]
+        if number.isdecimal():
+            splits[int(number)] = bag
+    parts: dict[str, list[BagFile]] = {}
+    part, end, last = recording, MIN_NS, MAX_NS
+    for nth, bag in sorted(splits.items()):
+        # Behind a split that was searched and then deleted, nothing begins.
+        is_unsearched = bag.start >= searched.get(part, MIN_NS) - OUT_OF_ORDER_NS
+        name = f"{recording}#{nth}"
+        if name in searched or (nth > last + 1 and is_unsearched) or _was_set_back(bag, end):
+            part, end = name, MIN_NS
+        parts.setdefault(part, []).append(bag)
+        end, last = max(end, bag.end), nth
+    return parts
+
+
+def recording_of(part: str) -> str:
+    """Returns the recording of a part, see `parts_of`."""
+    return part.partition("#")[0]
+
+
+def _was_set_back(bag: BagFile, end: Ns) -> bool:
+    """Whether a split begins before `end`, and not just with a latched message that came again."""
+    if bag.start >= end - OUT_OF_ORDER_NS:
+        return False
+    firsts = (topic.first for topic in bag.summary.topics if not topic.latched)
+    return min(firsts, default=end) < end - OUT_OF_ORDER_NS
+
+
 def chains_to_search(
     closed: Mapping[str, Sequence[BagFile]],
     live: Collection[str],
@@ -193,14 +242,15 @@ def chains_to_search(
     """Returns the parts of recordings that can be searched now.
 
     Args:
-        closed: the closed bags by recording, in the order in which the recordings began.
+        closed: the closed bags by part, see `parts_of`, in the order in which the recordings began.
         live: the recordings that are being written.
-        searched: until which log time each recording was searched.
+        searched: until which log time each part was searched.
         previous: returns the recording that one took over from, or None.
         split_ns: how long one bag is.
     """
     ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
-    written = {name: ends[name] if closed.get(name) else None for name in live}
+    newest = {recording_of(part): part for part in closed if closed[part]}
+    written = {newest.get(name, name): ends.get(newest.get(name, "")) for name in live}
     limits = horizons(ends, written, split_ns)
     chains: list[SearchChain] = []
     last: str | None = None
@@ -213,7 +263,7 @@ def chains_to_search(
         part = SearchPart(name, window, touched)
         is_known = name in searched
         predecessor = None if is_known else previous(name)
-        if last is not None and (is_known or predecessor == last):
+        if last is not None and (is_known or predecessor == recording_of(last)):
             chains[-1] = SearchChain((*chains[-1].parts, part), chains[-1].goes_on)
         else:
             chains.append(SearchChain((part,), is_known or predecessor in searched))
@@ -370,7 +420,7 @@ class SplitSearch:
         The first event has no topic: `heapq.merge` takes it before the bag is opened, so that bags
         are opened one after the other. A part that cannot be read becomes a problem of the rules.
         """
-        yield _Event(max(bag.start, part.window.start), "", part.recording, None)
+        yield _Event(max(bag.start, part.window.start), "", recording_of(part.name), None)
         watched: dict[str, tuple[Rule, ...]] = {}
         for topic in bag.summary.topics:
             if rules := self._rules_of(topic.topic):
@@ -403,11 +453,11 @@ class SplitSearch:
             for batch in self.reader.batches(bag.path, [topic], part.window, bare=[topic]):
                 times += ((time, topic) for time in batch.log_times.tolist())
         records = self.reader.records(bag.path, read, part.window) if read else ()
+        recording = recording_of(part.name)
         with_records = (
-            _Event(record.log_time, record.channel.topic, part.recording, record)
-            for record in records
+            _Event(record.log_time, record.channel.topic, recording, record) for record in records
         )
-        bare = (_Event(time, topic, part.recording, None) for time, topic in sorted(times))
+        bare = (_Event(time, topic, recording, None) for time, topic in sorted(times))
         yield from heapq.merge(with_records, bare, key=attrgetter("time"))
 
 

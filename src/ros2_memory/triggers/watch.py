@@ -25,7 +25,14 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Clock, Ns, Span, ns_from_unix
 from ros2_memory.retention.saved_moments import MomentKeeper, Refusal
-from ros2_memory.triggers.rules import Firing, Rule, SplitSearch, chains_to_search
+from ros2_memory.triggers.rules import (
+    Firing,
+    Rule,
+    SplitSearch,
+    chains_to_search,
+    parts_of,
+    recording_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -114,9 +121,11 @@ class Triggers:
             _log.warning("needed_bags_deleted", bags=deleted, reason=sentence)
             for record in state.rules.values():
                 record.problem = sentence
-        while len(state.searched) > MOST_SEARCHED:
-            state.before = next(iter(state.searched))
-            del state.searched[state.before]
+        names = [*dict.fromkeys(map(recording_of, state.searched))]
+        for name in names[:-MOST_SEARCHED]:
+            state.before = name
+            for part in [part for part in state.searched if recording_of(part) == name]:
+                del state.searched[part]
         # Set before it is written: if that fails, nothing is searched twice.
         self._is_written &= state == self._state
         self._state = state
@@ -131,10 +140,15 @@ class Triggers:
             found = self.search.search(chain, state, lambda: time.monotonic() > deadline)
             for firing in found.firings:
                 self._add_firing(firing, state, snapshot)
-            for recording, window, _ in chain.parts:
-                state.searched[recording] = max(min(window.stop, found.until), window.start)
+            for part, window, _ in chain.parts:
+                state.searched[part] = max(min(window.stop, found.until), window.start)
             if not found.is_complete:
                 break
+        for aside in snapshot.damaged:
+            if self.own.name_of(aside.path.parent) in map(recording_of, closed):
+                for record in state.rules.values():
+                    problem = f"not all could be searched: {aside.path.name}: {aside.reason}"
+                    record.problem = record.problem or problem
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that are not searched, and those before that a match may save."""
@@ -144,8 +158,8 @@ class Triggers:
         since = MIN_NS if reached is None else reached - before
         closed, _ = self._closed_bags(snapshot, state)
         needed: set[str] = set()
-        for name, bags in closed.items():
-            earliest = min(state.searched.get(name, MIN_NS), since)
+        for part, bags in closed.items():
+            earliest = min(state.searched.get(part, MIN_NS), since)
             needed.update(bag.file for bag in bags if bag.end >= earliest)
         return frozenset(needed)
 
@@ -180,8 +194,8 @@ class Triggers:
         """Returns a state in which all closed bags are searched."""
         closed, live = self._closed_bags(snapshot, TriggerState())
         ended = [name for name in self.own.in_order() if name not in live]
-        newest = {name: max(bag.end for bag in bags) for name, bags in closed.items()}
-        searched = {name: end + 1 for name, end in newest.items() if name in live}
+        newest = {part: max(bag.end for bag in bags) for part, bags in closed.items()}
+        searched = {part: end + 1 for part, end in newest.items() if recording_of(part) in live}
         return TriggerState(before=ended[-1] if ended else None, searched=searched)
 
     def _check_topic(self, rule: Rule, record: RuleRecord) -> None:
@@ -199,7 +213,7 @@ class Triggers:
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
     ) -> tuple[dict[str, list[BagFile]], frozenset[str]]:
-        """Returns the closed bags of recordings that are not searched to their end, in order.
+        """Returns the closed bags by part, of recordings that are not searched to their end.
 
         Also returns the names of the recordings that are being written.
         """
@@ -209,7 +223,8 @@ class Triggers:
         if state.before in names:
             first = names.index(state.before) + 1
         else:
-            first = min((names.index(name) for name in state.searched if name in names), default=0)
+            known = {*map(recording_of, state.searched)}.intersection(names)
+            first = min(map(names.index, known), default=0)
         folders = {str(self.bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
@@ -219,7 +234,10 @@ class Triggers:
                 name = folders.get(str(bag.recording))
                 if name is not None and (bag.state is BagState.CLOSED or name not in live):
                     closed[name].append(bag)
-        return {name: bags for name, bags in closed.items() if bags}, live
+        parts: dict[str, list[BagFile]] = {}
+        for name, bags in closed.items():
+            parts |= parts_of(name, bags, state.searched)
+        return parts, live
 
     def _previous(self, recording: str) -> str | None:
         handover = read_handover(self.bag_dir / recording).handover

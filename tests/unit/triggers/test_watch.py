@@ -246,6 +246,57 @@ def test_a_name_that_is_no_utf8_stops_neither_rules_nor_deletion(tmp_path: Path)
     assert len([*robot.bag_dir.glob("caf*/*")]) == 2  # those of the moment
 
 
+@pytest.mark.parametrize("back", [5, 60, 110])
+def test_what_happens_after_the_clock_was_set_back_fires_once(
+    robot: WatchedBags, back: int
+) -> None:
+    robot.begin(T0)
+    for begin in range(0, 100, 10):
+        robot.split(seconds(begin, begin + 10, {98}))
+        robot.look()
+    begin = 100 - back
+    robot.split(seconds(begin, begin + 10))
+    robot.look()
+    robot.house = robot.new_house()
+    # A match across two splits, and one when the clock has caught up.
+    held = [*range(begin + 15, begin + 25), 131]
+    for start in range(begin + 10, 140, 10):
+        robot.split(seconds(start, start + 10, held))
+        robot.look()
+    robot.close_all()
+    assert [(at - T0) // S for at in robot.fired_at()] == sorted([98, begin + 15, 131])
+
+
+def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.look()
+    bad = robot.split(seconds(10, 20, {15}))
+    with monkeypatch.context() as failing:
+        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+        fail_reading(failing, "summarize", lambda path: fault if path == bad else None)
+        for begin in (20, 30, 40):
+            robot.split(seconds(begin, begin + 10, {begin + 2}))
+            robot.clock.at = T0 + (begin + 10) * S
+            robot.look()
+        assert bad.name in (robot.record().problem or "")
+    robot.clock.at = T0 + 300 * S
+    robot.close_all()
+    assert [(at - T0) // S for at in robot.fired_at()] == [15, 22, 32, 42]
+
+
+def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    paths = [robot.split(seconds(begin, begin + 10, {25})) for begin in range(0, 50, 10)]
+    robot.look()
+    paths[1].unlink()
+    robot.split(seconds(50, 60))
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 25 * S]
+
+
 def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
