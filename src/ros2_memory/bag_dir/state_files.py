@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
-from itertools import chain
+from itertools import chain, starmap
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
@@ -668,10 +668,13 @@ class ScreenState:
     served, or read by other tasks of the recorder, until the file is listed as released: by then
     its excluded messages have been cut out. The state of the rules is written before a file is cut,
     since the messages cannot be read again.
+
+    `earlier` has the spans before those in `excluded`; those close to each other are one.
     """
 
     recordings: dict[str, RecordingScreen] = field(default_factory=dict)
     excluded: list[Excluded] = field(default_factory=list)
+    earlier: list[tuple[Int64, Int64]] = field(default_factory=list)
 
 
 class Withheld(NamedTuple):
@@ -715,7 +718,9 @@ def read_withheld(bag_dir: Path) -> Withheld:
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
     """Returns the excluded spans that overlap a window of log time."""
     state = read_withheld(bag_dir).state
-    spans = () if state is None else state.excluded
+    if state is None:
+        return []
+    spans = [*starmap(Excluded, state.earlier), *state.excluded]
     return [span for span in spans if span.start < stop and start < span.stop]
 
 

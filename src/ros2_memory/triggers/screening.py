@@ -19,7 +19,8 @@ import time
 from collections import Counter
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves
@@ -39,6 +40,7 @@ from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
 from ros2_memory.core.errors import BagError, EpisodicError, RecorderError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
@@ -68,7 +70,7 @@ MOST_AT_ONCE: Final = 16
 DONE_KEPT: Final = 2
 """So many finished recordings are remembered, since their values matter to later ones."""
 MOST_EXCLUDED: Final = 1000
-"""So many excluded stretches are remembered: the newest ones."""
+"""So many excluded stretches are remembered one by one, and as many spans that join older ones."""
 RETRY_S: Final = 30.0
 """How long until a split that could not be cut is tried again."""
 REMIND_S: Final = 600.0
@@ -139,7 +141,7 @@ class Screening:
             with self._lock:
                 known = self._loaded()
                 recordings = {**known.recordings, recording: RecordingScreen()}
-                self._write(ScreenState(recordings, known.excluded))
+                self._write(replace(known, recordings=recordings))
         except OSError as error:
             target = self.bag_dir / SCREENED_FILE
             raise RecorderError(f"{target}: {error.strerror or error}") from error
@@ -223,7 +225,9 @@ class Screening:
         state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
         if not summary.empty:
             excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
+            older = [stretch.span for stretch in excluded[:-MOST_EXCLUDED]]
             state.excluded = excluded[-MOST_EXCLUDED:]
+            state.earlier = _joined([*state.earlier, *older])
         self._problems.pop(_file_name(path), None)
         self._retry_s.pop(path, None)
 
@@ -481,7 +485,7 @@ class Screening:
             with_values = [name for name in done if recordings[name].start is not None]
             for name in {*done}.difference(with_values[-DONE_KEPT:]):
                 del recordings[name]
-            self._write(ScreenState(recordings, list(state.excluded)))
+            self._write(replace(state, recordings=recordings))
 
     def _write(self, state: ScreenState) -> None:
         """Writes a state if it has changed; call it with the lock held."""
@@ -495,6 +499,14 @@ class Screening:
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
         self._problems[name] = reason
+
+
+def _joined(spans: Spans) -> Spans:
+    """Returns few spans that cover these: those that are closest to each other are joined."""
+    spans = united(spans)
+    while len(spans) > MOST_EXCLUDED:
+        spans = united(spans, min(start - stop for (_, stop), (start, _) in pairwise(spans)))
+    return spans
 
 
 def _file_name(path: Path) -> str:

@@ -18,11 +18,13 @@ from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.triggers import screening
 from ros2_memory.triggers.exclusion import ExclusionRule
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.fakes import broken
 from tests.support.mcap_surgery import spoil_chunk
+from tests.support.memories import asked, memory_of
 from tests.support.noting_reader import fail_reading
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, off, on, privacy, word, words
 from tests.support.simulated_recorders import events
@@ -35,6 +37,26 @@ def bags(tmp_path: Path) -> ScreenedBags:
 
 def halves(begin: int, stop: int) -> list[float]:
     return [n + 0.5 for n in range(begin, stop)]
+
+
+def test_what_was_excluded_long_ago_is_neither_never_nor_a_gap(
+    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(screening, "MOST_EXCLUDED", 3)
+    name = bags.begin(0)
+    for begin in range(0, 160, 20):
+        around = [*map(off, range(begin, begin + 9)), *map(off, range(begin + 13, begin + 20))]
+        said = [*around, on(begin + 10), off(begin + 12), *words(begin, begin + 20)]
+        bags.split(name, sorted(said, key=lambda message: message.log_time))
+        bags.step()
+    bags.end()
+    memory, begun = memory_of(bags.bag_dir), T0 / S
+    inside = {"topic": "/chatter", "start": begun + 10.2, "end": begun + 11.8}
+    assert asked(memory, "get_topic_in_range", **inside)["reason"] == "deleted"
+    searched = {"topic": "/chatter", "condition_type": "contains", "value": "zebra"}
+    found = asked(memory, "find_last_match", **searched, before=begun + 30)
+    assert "excluded by the rules" in found["notes"][0]
+    assert len(excluded_between(bags.bag_dir, 0, MAX_NS)) <= 6
 
 
 def test_what_it_excludes_is_cut_with_its_margin(bags: ScreenedBags) -> None:
