@@ -7,7 +7,7 @@ that came later, takes a rotation. Splits are measured in the background.
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import Counter
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -172,7 +172,7 @@ class Reception:
 
     def __post_init__(self) -> None:
         self._losses = LossCounter()
-        self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
+        self._unwritten: list[Loss] = []
         self._arrivals = Arrivals()
         self._lock = threading.Lock()
         self.may_write = True
@@ -302,6 +302,10 @@ class Reception:
                 reason=f"{topic}: {counted(lost, 'message')} missing, by its counter, its stamps "
                 "or rosbag2's count: lost on the way to the disk, or never published",
             )
+        if dropped := len(self._unwritten[:-_MOST_UNWRITTEN]):
+            del self._unwritten[:dropped]
+            reason = "lost.jsonl cannot be written: answers will not name the oldest losses"
+            _log.warning("losses_dropped", losses=dropped, reason=reason)
         self._unwritten += losses
         if self.may_write and self._unwritten:
             try:

@@ -10,6 +10,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.state_files import Loss, read_losses
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR
@@ -188,6 +189,24 @@ def test_what_a_refused_publisher_sent_is_missing_after_the_clock_was_set_back(
     before = read_losses(tmp_path, T0 - 40 * NS, T0 - 22 * NS)
     assert [loss.topic for loss in before] == ["/odom", "/odom"]
     assert all(loss.start < loss.stop for loss in read_losses(tmp_path, MIN_NS, MAX_NS))
+
+
+def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reception_module, "_MOST_UNWRITTEN", 2)
+    made = reception(tmp_path)
+    made.overrides("a")
+    made.note_refused("a", "/odom")
+    made.may_write = False
+    with capture_logs() as log:
+        for number in range(5):
+            if number == 4:
+                made.may_write = True
+            made.learn("a", split(tmp_path / f"a_{number}.mcap", 5, 4))
+    dropped = [event["losses"] for event in log if event["event"] == "losses_dropped"]
+    assert sum(dropped) + len(read_losses(tmp_path, MIN_NS, MAX_NS)) == 5
+    assert len(read_losses(tmp_path, MIN_NS, MAX_NS)) == 2
 
 
 def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
