@@ -508,6 +508,16 @@ def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -
     assert counter.flush() == []
 
 
+def test_what_a_counter_misses_where_the_clock_was_set_back_is_between_both_times() -> None:
+    counter = LossCounter()
+    losses: list[Loss] = []
+    for begin, first in ((0, 0), (105, -60)):
+        at = [Position(begin + nth, T0 + (first + nth) * PERIOD) for nth in range(100)]
+        losses += counter.add_split("a", {"/odom": Progress("counter", at)})
+    [loss] = losses
+    assert (loss.lost, loss.start, loss.stop) == (5, T0 - 60 * PERIOD, T0 + 99 * PERIOD)
+
+
 def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
     counter = LossCounter()
     counter.begin("old")
