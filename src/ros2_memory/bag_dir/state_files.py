@@ -88,6 +88,8 @@ RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)
 
 MOST_LOST_BYTES: Final = 1 << 20
 """A longer file is shortened."""
+_APART_NS: Final[Ns] = 20 * NS_PER_S
+"""The longest time without a message from one split of a recording to the next."""
 EVERY_TOPIC: Final = "*"
 """Stands for all topics of a recording that ended unexpectedly."""
 INTERRUPTIONS: Final = MappingProxyType(
@@ -153,12 +155,12 @@ def _shortened(losses: Sequence[Loss]) -> Sequence[Loss]:
     return [*forgotten, *others]
 
 
-def _joined(losses: Iterable[Loss]) -> list[Loss]:
+def _joined(losses: Iterable[Loss], apart: Ns = _APART_NS) -> list[Loss]:
     """Returns losses in order of time; those of a topic that lie close together are one."""
     topics: dict[str, list[Loss]] = {}
     for loss in sorted(losses, key=attrgetter("start")):
         of_topic = topics.setdefault(loss.topic, [])
-        if of_topic and loss.start - of_topic[-1].stop <= _APART_NS:
+        if of_topic and loss.start - of_topic[-1].stop <= apart:
             last = of_topic.pop()
             stop, lost = max(last.stop, loss.stop), last.lost + loss.lost
             of_topic.append(replace(last, stop=stop, lost=lost))
@@ -177,6 +179,7 @@ def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
 # expired.json
 
 _MOST_EXPIRED: Final = 2000
+_LONGEST_APART_NS: Final[Ns] = 30 * NS_PER_DAY
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +203,9 @@ class Expired:
         again = {loss.topic for loss in going} if bag == self.bag else set()
         before = [loss for loss in self.going if loss.topic not in again]
         gone = _joined([*self.gone, *before])
+        if len(gone) > _MOST_EXPIRED:
+            # All older messages of a topic expire, so none is left between its losses.
+            gone = _joined(gone, _LONGEST_APART_NS)
         return Expired((*gone[-_MOST_EXPIRED:],), bag, going)
 
 
@@ -210,8 +216,6 @@ EXPIRED: Final = JsonDocument(EXPIRED_FILE, Expired)
 
 _MOST_DELETED_BYTES: Final = 1 << 18
 _MOST_SPANS: Final = 1000
-_APART_NS: Final[Ns] = 20 * NS_PER_S
-"""The longest time without a message from one split of a recording to the next."""
 _TOUCHING_NS: Final[Ns] = NS_PER_S
 """The longest time without a message from one recording to the next."""
 _LONGEST_NS: Final[Ns] = NS_PER_DAY

@@ -304,8 +304,8 @@ class Reception:
             )
         if dropped := len(self._unwritten[:-_MOST_UNWRITTEN]):
             del self._unwritten[:dropped]
-            reason = "lost.jsonl cannot be written: answers will not name the oldest losses"
-            _log.warning("losses_dropped", losses=dropped, reason=reason)
+            unnamed = "lost.jsonl cannot be written: answers will not name the oldest losses"
+            _log.warning("losses_dropped", losses=dropped, reason=unnamed)
         self._unwritten += losses
         if self.may_write and self._unwritten:
             try:

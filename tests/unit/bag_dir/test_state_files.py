@@ -24,6 +24,7 @@ from ros2_memory.bag_dir.own_recordings import LIST
 from ros2_memory.bag_dir.state_files import (
     DELETED,
     ERASING,
+    EXPIRED,
     FORGOTTEN,
     LOST,
     RECORDED,
@@ -33,6 +34,7 @@ from ros2_memory.bag_dir.state_files import (
     TRIGGERS,
     ConditionInterval,
     Erasure,
+    Expired,
     Loss,
     Receipt,
     RecordingScreen,
@@ -88,7 +90,7 @@ ERASURE = r"""{"format":1,"topics":["/a"],"windows":[[1,2]],"latched":["/\u00e4"
 "files":["f\udcff"],"counts":[{"topic":"/a","start":1,"stop":2,"count":3}]}"""
 SCREEN = """{"format":1,"recordings":{"rec_A":{"done":false,"start":1,"end":null,
 "files":{"a.mcap":"read"},"heard":{"home":[{"first":1,"last":2,"holds":null,"lasts":false}]},
-"unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}]}"""
+"unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}],"earlier":[[0,1]]}"""
 RULES = r"""{"format":1,"rules":{"t\u00fcr":{"fired":1,"moments":2,"refused":3,"last_fired":null,
 "problem":"\u00df","always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
 "start":1,"end":2,"matches":1,"known":false,"stored":false}],
@@ -359,6 +361,20 @@ def test_losses_that_are_dropped_are_the_oldest_and_none_that_were_forgotten(
     losses = read_losses(tmp_path, 0, 2 * T0)
     assert len(losses) < 100
     assert [loss for loss in losses if loss.by != "counter"] == [*forgotten, refused]
+
+
+def test_all_that_expired_is_known_however_often_the_robot_was_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "_MOST_EXPIRED", 20)
+    expired, hour = Expired(), 3600 * 10**9
+    for n in range(50):
+        loss = Loss("/camera", T0 + n * hour, T0 + n * hour + 10**9, 5, "expired")
+        expired = expired.then(f"rec_A/rec_A_{n}.mcap", [loss])
+    EXPIRED.write(tmp_path, expired)
+    assert read_losses(tmp_path, T0, T0 + hour)
+    everything = read_losses(tmp_path, 0, 2 * T0)
+    assert (len(everything) <= 21, sum(loss.lost for loss in everything)) == (True, 250)
 
 
 def test_rows_that_one_program_appends_while_another_shortens_the_file_stay(
