@@ -9,7 +9,7 @@ from ros2_memory.bag_dir.layout import is_derived, is_thinned
 from ros2_memory.bag_dir.state_files import deleted_spans
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import SetAside
-from ros2_memory.core.spans import lies_inside, overlaps_any, united, without
+from ros2_memory.core.spans import lies_inside, overlaps_any, spans_of, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -123,16 +123,18 @@ class JoinedIndex:
 
 
 def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFile]:
-    """Returns the own bags of the days that are shown whose first message is in no shipped bag.
+    """Returns the own bags of the days that are shown with the times of no shipped bag.
 
-    A derived bag begins with a message of a recorded one, and is new all the same.
+    A derived bag may have the times of a recorded one, and is new all the same.
     """
     after = MIN_NS if shipped.older is None else shipped.older
-    in_lake = {*shipped.timeline.starts.tolist()}
+    # Two runs of a simulation may begin at one moment of its clock.
+    in_lake = {*spans_of(shipped.timeline.starts, shipped.timeline.ends)}
     return [
         bag
         for bag in own.bags
-        if after < bag.start <= until and (bag.start not in in_lake or is_derived(bag.file))
+        if after < bag.start <= until
+        and ((bag.start, bag.end) not in in_lake or is_derived(bag.file))
     ]
 
 

@@ -131,6 +131,15 @@ def test_a_bag_by_whose_name_the_lake_has_another_one_is_named_and_not_taken_for
     assert "the lake has another bag of this name" in str(found["notes"])
 
 
+def test_a_bag_that_begins_when_a_shipped_one_does_is_not_taken_for_it(tmp_path: Path) -> None:
+    """As of two runs of a simulation, whose clock begins anew."""
+    write_bag(tmp_path / "hall", 0)
+    ship_from(tmp_path)
+    write_bag(tmp_path / "hall", 1, at_s=START_S, most=8)
+    asked = {"robot": "hall", "topic": "/chatter", "timestamp": START_S + 7}
+    assert reply(served(tmp_path), "get_topic_at_time", asked).get("value") == {"value": "n107"}
+
+
 def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_one(
     tmp_path: Path,
 ) -> None:
