@@ -146,11 +146,10 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
 
 def lake_in(folder: Path) -> SqlCatalog:
     """The catalogue of the lake in a folder."""
-    state_dir = location(folder).state_dir
-    state_dir.mkdir(parents=True, exist_ok=True)
-    return SqlCatalog(
-        "lake", uri=f"sqlite:///{state_dir}/{CATALOGUE_FILE}", warehouse=folder.as_uri()
-    )
+    where = location(folder)
+    where.state_dir.mkdir(parents=True, exist_ok=True)
+    uri = f"sqlite:///{where.state_dir}/{CATALOGUE_FILE}"
+    return SqlCatalog("lake", uri=uri, warehouse=where.warehouse)
 
 
 def lake_robots(

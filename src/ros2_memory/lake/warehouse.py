@@ -38,6 +38,7 @@ from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 from pyiceberg.manifest import ManifestContent, ManifestFile
 from pyiceberg.table import Transaction
 from pyiceberg.transforms import IdentityTransform
+from sqlalchemy import URL
 
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
@@ -175,11 +176,13 @@ class LakeLocation:
             if self._is_file:
                 self.state_dir.mkdir(parents=True, exist_ok=True)
             file = self.state_dir.absolute() / CATALOGUE_FILE
+            # In a raw path SQLAlchemy decodes `%41`, and `?` ends it.
+            sqlite = URL.create("sqlite", database=os.fspath(file))
             required = {
                 "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
                 RECORD: os.fspath(file.parent),
                 "warehouse": self.warehouse,
-                "uri": f"sqlite:///{file}" if self._is_file else self.uri or "",
+                "uri": str(sqlite) if self._is_file else self.uri or "",
             }
             catalog = kind("lake", **{**self.properties, **self.secrets, **required})
         with closing(catalog):
@@ -336,7 +339,8 @@ def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
     """Returns the URI of a warehouse, which may be given as a path, and the state directory.
 
     Raises:
-        ValueError: the warehouse is in a store, and there is no state directory.
+        ValueError: the warehouse is in a store, and there is no state directory; or no URI can have
+            its path.
     """
     scheme, colon, rest = warehouse.partition("://")
     if colon and scheme != "file":
@@ -344,7 +348,10 @@ def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
             raise ValueError(f"a warehouse in {scheme} needs lake.state_dir, a local folder")
         return warehouse, state_dir
     folder = Path(rest if colon else warehouse).expanduser().absolute()
-    return folder.as_uri(), folder / ".ros2-memory" if state_dir is None else state_dir
+    if not {"?", "#"}.isdisjoint(str(folder)):
+        raise ValueError(f"{folder} has ? or #, which end the path in the URI of a table")
+    # Not `as_uri`: pyiceberg and Arrow take the path as it stands, and would make a folder `%20`.
+    return f"file://{folder}", folder / ".ros2-memory" if state_dir is None else state_dir
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 import threading
 from dataclasses import replace
@@ -24,6 +25,7 @@ from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.rows import RowMaker, sha256_of
+from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
@@ -351,6 +353,28 @@ def test_killed_at_any_point_it_loses_and_doubles_nothing(
     assert values(tmp_path / "lake") == written(bags)
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == bags
     assert lake_column(tmp_path / "lake", "sightings", "label") == ["cup"] * bags
+
+
+def test_a_lake_lies_in_the_folder_that_is_named_whatever_its_name_has(tmp_path: Path) -> None:
+    folder = tmp_path / "usb disk, ä %41 100%"
+    ship_and_ask(location(folder), tmp_path / "hall")
+    assert {*tmp_path.iterdir()} == {folder, tmp_path / "hall"}
+    for refused in ("a?b", "a#b"):
+        with pytest.raises(ValueError, match=f"{re.escape(refused)} has [?] or #"):
+            location(tmp_path / refused)
+
+
+def test_a_lake_goes_on_where_an_older_version_put_it(tmp_path: Path) -> None:
+    folder = tmp_path / "usb disk"
+    older = replace(location(folder), warehouse=folder.as_uri())
+    for number, where in enumerate((older, location(folder))):
+        write_bag(tmp_path / "hall", number)
+        with where.writable() as tables:
+            robots = [robot_bags("hall", tmp_path / "hall")]
+            assert Shipper(tables, robots, FixedClock(LATER)).run().bags == 1
+    assert lake_column(folder, "sightings", "label") == ["cup"] * 2
+    assert not [*folder.rglob("*.parquet")]
+    assert [*(tmp_path / "usb%20disk").rglob("*.parquet")]
 
 
 def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path) -> None:
