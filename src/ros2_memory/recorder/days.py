@@ -475,7 +475,7 @@ class MemoryDays:
         message = _without_hidden(whole, self._is_hidden)
         if message is not whole and getattr(message, "transforms", None) == []:
             return None
-        if self._names_people(message, channel.type):
+        if message is None or self._names_people(message, channel.type):
             return None
         if rounds:
             message = rounded(message, self.reader.definition(channel))
@@ -649,7 +649,8 @@ def _labels_in_json(text: str) -> Iterator[tuple[str, str]]:
 def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> object:
     """Returns a decoded message without the entries of its lists that have a hidden label.
 
-    A list of texts names the entries of lists of the same length: `name` and `position`.
+    A list of texts names the entries of lists of the same length: `name` and `position`. None if it
+    has hidden ones, and the message a list of another length, such as four numbers for each name.
     """
     if not is_dataclass(message) or isinstance(message, type):
         return message
@@ -661,7 +662,9 @@ def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> o
     for name, items in lists.items():
         rows = set(hidden[name])
         for other, texts in lists.items():
-            if len(texts) == len(items) and all(isinstance(text, str) for text in texts):
+            if len(items) and hidden[other] and all(isinstance(text, str) for text in texts):
+                if len(items) != len(texts):
+                    return None
                 rows |= hidden[other]
         if rows and isinstance(items, np.ndarray):
             changed[name] = np.delete(items, [*rows], axis=0)
