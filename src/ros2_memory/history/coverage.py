@@ -598,17 +598,19 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     does not count, unless the whole window is later. With an open end (`MAX_NS`), nor does time
     after the memory.
     """
-    earliest, latest, memory = view.snapshot.earliest, view.snapshot.latest, view.memory
-    if earliest is None or latest is None:
+    snapshot, memory = view.snapshot, view.memory
+    reach = recorded_reach(snapshot, asked)
+    if reach is None:
         return
+    first, last = reach
     start, end = asked.asked()
-    start = max(start, min(0, earliest))
-    until = latest if asked.stop >= MAX_NS else memory.now(memory.clock.now(), latest)
+    start = max(start, min(0, first))
+    until = last if asked.stop >= MAX_NS else memory.now(memory.clock.now(), snapshot.latest)
     if start < until:
         end = min(end, until)
     counted_window = TimeWindow(start, end)
-    before, after = max(min(end, earliest) - start, 0), max(end - max(start, latest), 0)
-    gaps = [last - first for first, last in recording_gaps(view, counted_window)]
+    before, after = max(min(end, first) - start, 0), max(end - max(start, last), 0)
+    gaps = [stop - begin for begin, stop in recording_gaps(view, counted_window)]
     when = f"between {unix_text(start)} and {unix_text(end)}"
     deleted = was_removed(view, counted_window)
     if gap_around(view, asked) is not None:

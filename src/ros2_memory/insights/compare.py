@@ -34,6 +34,7 @@ from ros2_memory.history.coverage import (
     note_unread,
     note_unrecorded,
     recording_gaps,
+    shown_span,
     unix_text,
 )
 from ros2_memory.history.driven_path import length_notes, resolve_path_topic
@@ -571,13 +572,7 @@ def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, float]:
 
 def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
     """Returns how many seconds of a window were recorded. Pauses shorter than a split count."""
-    start, end = window.asked()
-    earliest, latest = view.snapshot.earliest, view.snapshot.latest
-    if earliest is None or latest is None:
-        return 0.0
-    recorded = without(
-        [(max(start, earliest), min(end, latest))], united(recording_gaps(view, window))
-    )
+    recorded = without([shown_span(view.snapshot, window)], united(recording_gaps(view, window)))
     return unix_from_ns(elapsed.among(recorded))
 
 

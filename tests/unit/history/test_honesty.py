@@ -326,6 +326,16 @@ def test_what_is_wrong_with_a_bag_is_reported_once(tmp_path: Path) -> None:
 DAY = 24 * 3600 * S
 
 
+def test_a_time_of_a_wrong_clock_is_recorded_as_any_other(tmp_path: Path) -> None:
+    for name, start_s in (("unset", 1000 - T0_S), ("set", 0)):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages(start_s, 60))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    unset = {"start": 1000, "end": 1059}
+    compared = asked(memory, "compare", **unset, with_start=T0_S, with_end=T0_S + 59)
+    assert compared["recorded_s"] == {"this": 59.0, "with": 59.0}
+    assert "recorded only" not in str(asked(memory, "recap", **unset))
+
+
 def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
