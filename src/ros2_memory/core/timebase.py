@@ -42,7 +42,8 @@ _DIGITS: Final = re.compile(r"[0-9]{9,}(\.[0-9]+)?")
 _DATE_WITHOUT_DASHES: Final = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 # Not every text that `datetime` reads: it takes 17840232 for a day of the year 1784.
 _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
-_SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
+_SECONDS: Final = re.compile(r"(?::\d\d:|\d[T ]\d{4})\d\d(?:[.,](\d+))?")
+_MINUTES: Final = re.compile(r"[T ]\d\d:?\d\d")
 _END_OF_DAY: Final = re.compile(r"(?<=[T ])24:00(?::00)?(?![:.,0-9])")
 """Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
 _MIDNIGHT: Final = re.compile(r"24(?::?00){1,2}")
@@ -247,7 +248,7 @@ def _written_span_s(written: str) -> float:
     """
     if _SECONDS.search(written) or not _ISO.fullmatch(written):
         return rest_of_text_s(written)
-    if ":" in written:
+    if _MINUTES.search(written):
         return _MINUTE_S - _END_S
     date = datetime.fromisoformat(written)
     if (date.hour, date.minute) != (0, 0) or "T" in written.upper():

@@ -33,6 +33,27 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     assert found["timestamp"] == hours[1] / NS_PER_S
 
 
+@pytest.mark.parametrize(
+    ("written", "total"),
+    [
+        ("20261118T044103Z", 4),
+        ("20261118T044103.2+0000", 1),
+        ("20261118T044103+00:00", 4),
+        ("2026-11-18T04:41:03Z", 4),
+        ("20261118T0441Z", 240),
+        ("20261118T04+00:00", 0),
+    ],
+)
+def test_a_second_or_a_minute_is_as_long_however_it_is_written(
+    tmp_path: Path, written: str, total: int
+) -> None:
+    begin = round(datetime(2026, 11, 18, 4, 41, tzinfo=UTC).timestamp()) * NS_PER_S
+    times = range(begin + 2 * NS_PER_S // 10, begin + 120 * NS_PER_S, NS_PER_S // 4)
+    write_mcap(tmp_path / "bag.mcap", [text(at, "here") for at in times])
+    window = {"topic": "/chatter", "start": written, "end": written}
+    assert asked(memory_of(tmp_path), "get_topic_in_range", **window).get("total", 0) == total
+
+
 S = 10**9
 T0 = 1_795_144_010
 """Of messages at 10 Hz, each 45,892,003 ns after a tenth of a second, along x at 1 m/s."""
