@@ -157,6 +157,24 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
         assert found["mean"] == pytest.approx(positions, abs=1e-4)
 
 
+def test_a_plot_has_the_same_points_however_bags_are_cut_and_with_stored_columns(
+    tmp_path: Path,
+) -> None:
+    """Of poses at 1 Hz, and at 20 Hz in each third bin of 3 s."""
+    times = [BEGIN + n * S // 20 for n in range(20 * 90) if n % 20 == 0 or n // 60 % 3 == 2]
+    found = []
+    for size in (7, 1000):
+        folder = tmp_path / str(size)
+        write_splits(folder, [odom(at, 0.0, 0.0) for at in times], size)
+        plain = memory_of(folder)
+        for asked_of in (plain, replace(plain, scanner=stored_columns(plain, folder))):
+            query = f"start={BEGIN_S}&end={BEGIN_S + 1200}&signal=/odom:pose.pose.position.x"
+            [signal] = shown(asked_of, query)["signals"]
+            found.append(signal["t"])
+    assert found == [found[0]] * 4
+    assert len(found[0]) == pytest.approx(30, abs=1)
+
+
 @pytest.mark.parametrize("signal", ["/odom:no.such.field", "/nowhere:x"])
 def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
     memory: Memory, signal: str

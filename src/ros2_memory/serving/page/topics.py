@@ -162,9 +162,8 @@ def _signal_parts(
 
 
 def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]:
-    """Returns for each bin with numbers its mean time (Unix s), least, mean and greatest number."""
-    middles = np.array([(part.first + part.last) // 2 for part in parts], np.int64)
-    bins = middles // width
+    """Returns for each bin with numbers its middle (Unix s), least, mean and greatest number."""
+    bins = np.array([part.first for part in parts], np.int64) // width
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     counts = np.array([part.size for part in parts], np.float64)
     bin_counts = np.add.reduceat(counts, starts)
@@ -176,7 +175,7 @@ def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]
     means = np.add.reduceat(totals, starts) / bin_counts / SUM_SCALE
     # The sum of a part is of rounded numbers, and may lie beyond the exact least and greatest.
     means = np.clip(means, lows, highs)
-    times = np.add.reduceat(middles / NS_PER_S * counts, starts) / bin_counts
+    times = (bins[starts] + 0.5) * width / NS_PER_S
     columns = zip(times.tolist(), lows.tolist(), means.tolist(), highs.tolist(), strict=True)
     return [
         (round(time, 3), rounded(low, 6), rounded(mean, 6), rounded(high, 6))
