@@ -301,6 +301,21 @@ def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory
     assert found["places_robot"] == [{"topic": "/odom", "kind": "poses"}]
 
 
+@pytest.mark.parametrize(("split_s", "most_times"), [(10, 20_000), (600, 20_000), (600, 0)])
+def test_every_message_is_counted_when_it_was_also_where_bags_have_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, split_s: int, most_times: int
+) -> None:
+    """Ten minutes at 10 Hz, of which the middle 100 s are looked at."""
+    monkeypatch.setattr("ros2_memory.serving.page.topics._MOST_TIMES", most_times)
+    write_splits(tmp_path, [odom(BEGIN + n * S // 10, 0.0, 0.0) for n in range(6000)], split_s)
+    query = f"start={BEGIN_S + 250}&end={BEGIN_S + 350}"
+    [row] = topics(memory_of(tmp_path), query)["topics"]
+    assert sum(row["spoke"]) == pytest.approx(1000, abs=1)
+    assert set(row["spoke"]) <= {16, 17}
+    [silent] = topics(memory_of(tmp_path), f"start={BEGIN_S + 0.91}&end={BEGIN_S + 0.99}")["topics"]
+    assert silent["spoke"] == [0] * 60 or not most_times
+
+
 def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
     """Whatever time is looked at, the origin is the same."""
     messages = [fix(BEGIN + n * S, n * 1e-5, n * 1e-5) for n in range(20)]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import united_tables
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -228,29 +229,24 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
 
 
 def _count_in_bins(view: View, topic: str, window: TimeWindow) -> Ints:
-    """Returns how many messages each bin of a window has."""
-    length: Ns = window.stop - window.start
-    times = np.concatenate([np.zeros(0, np.int64), *_message_times(view, topic, window)])
-    inside = times[(times >= window.start) & (times < window.stop)] - window.start
-    return np.bincount((inside / length * BINS).astype(np.int64).clip(0, BINS - 1), minlength=BINS)
+    """Returns how many messages each bin of a window has.
 
-
-def _message_times(view: View, topic: str, window: TimeWindow) -> list[Ints]:
-    """Returns the log times of messages, bag by bag; spread evenly if reading them takes long."""
+    They count as spread evenly over their bags if these are short, or reading them takes long.
+    """
     extents = [*view.timeline.extents(topic, window)]
-    spread: list[Ints] = []
-    messages = 0
-    for extent in extents:
-        for summary in extent.bag.summary.of(topic):
-            messages += summary.count
-            count = min(summary.count, BINS)
-            spread.append(np.linspace(extent.first, extent.last, count, dtype=np.int64))
-    width = max((window.stop - window.start) // BINS, 1)
+    counts = [sum(part.count for part in extent.bag.summary.of(topic)) for extent in extents]
+    edges = np.linspace(0, window.stop - window.start, BINS + 1)
     longest = max((extent.last - extent.first for extent in extents), default=0)
-    if longest > width and messages <= _MOST_TIMES:
+    if longest > edges[1] and sum(counts) <= _MOST_TIMES:
         with suppress(QueryTimeoutError):
-            return [rows.times for rows in scan(view, topic, window, columns=False)]
-    return spread
+            scanned = scan(view, topic, window, columns=False)
+            times = concatenated(rows.times for rows in scanned)
+            return np.histogram(times - window.start, edges)[0]
+    before_edges = np.zeros(BINS + 1)
+    for extent, count in zip(extents, counts, strict=True):
+        ends = extent.first - window.start, extent.last + 1 - window.start
+        before_edges += np.interp(edges, ends, (0, count))
+    return np.diff(np.rint(before_edges)).astype(np.int64)
 
 
 def _plottable_fields(view: View, topic: str) -> list[str]:
