@@ -212,7 +212,7 @@ def _has_name_alone(value: JsonObject) -> bool:
     """Returns whether an object has nothing beside its name, or lists of numbers or points."""
     others = [part for name, part in value.items() if name not in _NAMED_BY]
     lists = [part for part in others if isinstance(part, list)]
-    return not others or any(isinstance(part[0], int | float | list) for part in lists if part)
+    return not others or any(type(part[0]) in {int, float, list} for part in lists if part)
 
 
 def _label(value: JsonObject) -> str | None:

@@ -89,6 +89,7 @@ PUMP: JsonValue = {"label": "pump", "score": 0.5}
         ({"class": "battery", "level": {"is": "low"}, "cells": []}, []),
         ({"alarm": {"class": "battery", "level": "low"}}, []),
         ({"class": "none", "level": "ok"}, []),
+        ({"label": "docked", "flags": [True, False]}, []),
         ({"class": "none"}, []),
         ([{"class": "none"}], []),
         ({"n": 1, "class": "EVT", "deep": {"list": [PUMP, {"label": "valve"}]}}, ["pump", "valve"]),
