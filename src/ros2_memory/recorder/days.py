@@ -335,8 +335,8 @@ class MemoryDays:
         if counted_at_s is not None:
             left_s = max(left_s - (now_s - counted_at_s), 0.0)
         if counted_at_s is None or now_s - counted_at_s >= COUNTED_S or not left_s:
-            self._counted_at_s = now_s
             LEAVING.write(self.bag_dir, Leaving(left_s))
+            self._counted_at_s = now_s
         if counted_at_s is None:
             _log.warning("memory_leaves", days=days, left_s=left_s)
         return left_s

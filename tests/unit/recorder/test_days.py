@@ -27,6 +27,7 @@ from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, THINNED_FILE
 from ros2_memory.bag_dir.moment_file import Outcome
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
+    LEAVING,
     SUPERSEDED,
     THINNED,
     Thinned,
@@ -241,6 +242,24 @@ def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir
     keeper.apply()
     assert not (bag_dir / "memory").exists()
     assert not (bag_dir / LEAVING_FILE).exists()
+
+
+def test_days_go_a_day_after_a_warning_also_where_the_disk_was_full_at_first(
+    bag_dir: Path,
+) -> None:
+    split(bag_dir, 0)
+    keep_all(bag_dir)
+    monotonic = SettableClock(0)
+    days = days_of(bag_dir, keeps=False, monotonic=lambda: monotonic.now() / S)
+    with broken(type(LEAVING), "write"), pytest.raises(OSError, match="No space"):
+        days.clear()
+    monotonic.at += 3600 * S
+    with capture_logs() as logs:
+        days.clear()
+    assert [entry["event"] for entry in logs] == ["memory_leaves"]
+    monotonic.at += 23 * 3600 * S
+    days.clear()
+    assert days_in(bag_dir)
 
 
 def test_nothing_is_written_while_messages_are_forgotten(bag_dir: Path) -> None:
