@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
 from ros2_memory.bag_dir.state_files import deleted_spans
 from ros2_memory.core.memo import Key
-from ros2_memory.core.model import SetAside
-from ros2_memory.core.spans import lies_inside, overlaps_any, spans_of, united, without
+from ros2_memory.core.model import BagFile, SetAside, TimeWindow
+from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns, Span
     from ros2_memory.history.context import SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
@@ -104,9 +103,13 @@ class JoinedIndex:
         self, shipped: Snapshot, own: Timeline, until: Ns
     ) -> tuple[Timeline, tuple[SetAside, ...]]:
         """Returns the bags of both, and own bags whose path another bag has in the lake."""
-        bags = _bags_not_in_lake(shipped, own, until)
+        bags, replaced = _bags_not_in_lake(shipped, own, until), dict[str, BagFile]()
         if own.thinned:
-            bags = _without_shipped_days(bags, shipped.timeline, deleted_spans(self.bag_dir))
+            deleted = deleted_spans(self.bag_dir)
+            bags, replaced = _each_day_once(bags, shipped.timeline, deleted)
+            # Their bags are not deleted, as that at the end of a day.
+            for bag in own.bags:
+                replaced.pop(bag.file, None)
         same_path = {
             bag.file: bag for bag in shipped.timeline.bags_named({bag.file for bag in bags})
         }
@@ -119,7 +122,7 @@ class JoinedIndex:
             # A bag without its first messages, which were deleted, is the one in the lake.
             elif not (in_lake.start <= bag.start and bag.end <= in_lake.end):
                 set_aside.append(SetAside(bag.path, _NAME_IN_USE))
-        return shipped.timeline.changed((), named), tuple(set_aside)
+        return shipped.timeline.changed(replaced.values(), named), tuple(set_aside)
 
 
 def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFile]:
@@ -138,19 +141,29 @@ def _bags_not_in_lake(shipped: Snapshot, own: Timeline, until: Ns) -> list[BagFi
     ]
 
 
-def _without_shipped_days(
+def _each_day_once(
     bags: Sequence[BagFile], shipped: Timeline, deleted: Sequence[Span]
-) -> list[BagFile]:
-    """Returns the bags without the thinned days whose deleted bags are all in the lake.
+) -> tuple[list[BagFile], dict[str, BagFile]]:
+    """Returns own bags without thinned days of which the lake has more than it lacks.
 
-    Days before the oldest of the `deleted` spans stay: whether the lake has their bags is unknown.
+    Also the lake's bags, by path, of the thinned days that stay: a rounded message is no copy of
+    the recorded one, and both would count. Before the oldest of the `deleted` spans all is deleted.
     """
-    spans = zip(shipped.starts.tolist(), (shipped.ends + 1).tolist(), strict=True)
-    lost = without(deleted, united(spans, NS_PER_S))
-    return [
-        bag
-        for bag in bags
-        if not is_thinned(bag.file)
-        or not lies_inside(deleted, bag.start)
-        or overlaps_any(lost, bag.start, bag.end)
-    ]
+    in_lake = united(spans_of(shipped.starts, shipped.ends + 1), NS_PER_S)
+    deleted = [(MIN_NS, deleted[0][0] if deleted else MAX_NS), *deleted]
+    left: list[BagFile] = []
+    replaced: dict[str, BagFile] = {}
+    for bag in bags:
+        if is_thinned(bag.file):
+            day = TimeWindow(bag.start, bag.end + 1)
+            lacks = without([(day.start, day.stop)], in_lake)
+            lost_ns = _length(lacks) - _length(without(lacks, deleted))
+            if day.stop - day.start - _length(lacks) > lost_ns:
+                continue
+            replaced |= {each.file: each for each in shipped.overlapping(day)}
+        left.append(bag)
+    return left, replaced
+
+
+def _length(spans: Spans) -> Ns:
+    return sum(stop - start for start, stop in spans)

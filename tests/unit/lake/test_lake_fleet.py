@@ -154,29 +154,34 @@ def test_a_bag_that_lost_its_first_message_since_it_was_shipped_is_not_another_o
     assert reply(fleet, "find_last_match", CUP | {"value": "tree"})["never"] == ["hall"]
 
 
-@pytest.mark.parametrize(("shipped", "has_first"), [(3, True), (3, False), (2, False)])
-def test_what_stayed_of_a_day_counts_only_where_a_bag_of_it_was_not_shipped(
-    tmp_path: Path, shipped: int, *, has_first: bool
+@pytest.mark.parametrize(
+    ("shipped", "first", "left"), [(3, 0, 0), (3, 3, 0), (2, 3, 0), (1, 0, 0), (1, 9, 1)]
+)
+def test_of_a_day_counts_what_was_shipped_or_what_stayed_if_less_was_shipped(
+    tmp_path: Path, shipped: int, first: int, left: int
 ) -> None:
-    """Retention deletes the bags of a day, of which some messages stay, rounded (`memory.keep`)."""
+    """Retention deletes the bags of a day, of which some messages stay, rounded (`memory.keep`).
+
+    The first of the bags may be `left`, with the first message that stays.
+    """
     bags = [write_bag(tmp_path / "hall", number, most=10) for number in range(3)]
     for bag in bags[shipped:]:
         bag.rename(tmp_path / bag.name)
     ship_from(tmp_path)
-    for bag in bags:
+    for bag in bags[left:]:
         bag.unlink(missing_ok=True)
-    starts = [(START_S + 10 * nth) * NS_PER_S for nth in range(3)]
-    named = [(f"rec_{nth}", start, start + 9 * NS_PER_S) for nth, start in enumerate(starts)]
-    append_deleted(tmp_path / "hall", [deleted_of("rec", named)])
-    first = 0 if has_first else 3
+    ends = [(START_S + 10 * nth) * NS_PER_S for nth in range(4)]
+    named = [(f"rec_{nth}", ends[nth], ends[nth + 1] - NS_PER_S) for nth in range(3)]
+    append_deleted(tmp_path / "hall", [deleted_of("rec", named[left:])])
     stayed = [text((START_S + nth) * NS_PER_S, "n") for nth in range(first, 30, 3)]
     write_mcap(tmp_path / "hall" / MEMORY_FOLDER / memory_file("20261120"), stayed)
     found = reply(served(tmp_path), "get_topic_in_last", CHATTER)
-    is_needed = shipped < 3
-    assert found["total"] == 10 * shipped + (len(stayed) if is_needed else 0)
+    is_needed = shipped == 1
+    assert found["total"] == (len(stayed) + 10 * left if is_needed else 10 * shipped)
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "n"}
     last = reply(served(tmp_path), "find_last_match", {**wanted, "robot": "hall"})
-    assert last["timestamp"] == START_S + (27 if is_needed else 29)
+    assert last["timestamp"] == START_S + (27 if is_needed else 10 * shipped - 1)
+    assert ("only some messages stayed" in str(last)) is is_needed
 
 
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
