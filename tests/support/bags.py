@@ -313,8 +313,8 @@ def twist(vx: float, wz: float) -> object:
 
 def odom(
     ns: int,
-    x: float,
-    y: float,
+    x: float = 0.0,
+    y: float = 0.0,
     yaw: float = 0.0,
     *,
     vx: float = 0.0,

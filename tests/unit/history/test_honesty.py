@@ -49,7 +49,7 @@ def messages(start_s: int, seconds: int = 10) -> list[Msg]:
     for second in range(start_s, start_s + seconds):
         at = T0 + second * S
         made += [
-            odom(at, second * 0.1, 0.0),
+            odom(at, second * 0.1),
             tf(at, transform(at, "odom", "base_link", (second * 0.1, 0.0, 0.0))),
             boolean(at, second % 7 == 0),
         ]
@@ -160,7 +160,7 @@ def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
 ) -> None:
     reply = asked(torn, tool, **given)
     assert reply is None or "error" not in reply
-    assert not any("could not be read" in note for note in notes_of(reply))
+    assert "could not be read" not in str(notes_of(reply))
 
 
 def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_future_is(
@@ -268,8 +268,8 @@ def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
         reply = asked(memory, tool, **given_)
         assert (reply["error"], reply["reason"]) == ("no_data", "undecodable")
         assert "(keelson.Envelope) are recorded but cannot be decoded" in reply["detail"]
-        assert any("may hold more: f/f_0.mcap" in note for note in reply["notes"])
-        of_all = any("messages of 3 topics could not be decoded" in n for n in reply["notes"])
+        assert "may hold more: f/f_0.mcap" in str(reply["notes"])
+        of_all = "messages of 3 topics could not be decoded" in str(reply["notes"])
         assert of_all == (given_ is not window and topics == 3)
 
 
@@ -295,7 +295,7 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     [sighting] = reply["sightings"]
     assert (sighting["first_seen"], sighting["last_seen"]) == (T0_S + seen[0], T0_S + seen[-1])
     assert (sighting["count"], reply["total"]) == (len(seen), 1)
-    assert any("could not be decoded" in note for note in reply["notes"])
+    assert "could not be decoded" in str(reply["notes"])
 
 
 def test_what_is_wrong_with_a_bag_is_reported_once(tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_a_reply_names_the_damage_of_its_window_alone(
     made: list[Msg] = []
     for at in range(T0, T0 + 60 * S, S // 5):
         moved = tf(at, transform(at, "map", "odom", (1.0, 0.0, 0.0)))
-        made += [odom(at, (at - T0) / S / 20, 0.0), moved, detections(at, ["cup"])]
+        made += [odom(at, (at - T0) / S / 20), moved, detections(at, ["cup"])]
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", made, McapLayout(chunk_size=8000))
     for at in (T0 + 10 * S, T0 + 50 * S):
         chunks = enumerate(chunks_of(path))
@@ -405,4 +405,4 @@ def test_a_reply_names_the_damage_of_its_window_alone(
         window = {"start": T0_S + start, "end": T0_S + start + 12}
         reply = asked(memory, tool, **given, **window)
         assert "error" not in reply
-        assert any("could not be read whole" in note for note in notes_of(reply)) == is_named
+        assert ("could not be read whole" in str(notes_of(reply))) == is_named

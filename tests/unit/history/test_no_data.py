@@ -112,7 +112,7 @@ NOTHING = [((-50, -20), "outside_range"), ((70, 90), "gap"), ((160, 190), "outsi
 def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gap")
     for name, driven in (("a", range(40)), ("b", range(140, 150))):
-        messages = [odom(T0 + at * S, 0.1 * at, 0.0) for at in driven]
+        messages = [odom(T0 + at * S, 0.1 * at) for at in driven]
         begin = T0 + driven[0] * S
         messages += [boolean(begin, True), detections(begin, ["cup"])]
         messages.append(log_entry(begin, 40, "motor", "too hot"))
@@ -153,9 +153,9 @@ def test_a_window_that_is_recorded_in_part_says_how_much(memory: Memory, tool: s
     window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
     assert f"recorded only 48 of 149 s {window}" in told["notes"]
     whole = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
-    assert not any("recorded" in note for note in whole.get("notes", ()))
+    assert "recorded" not in str(whole.get("notes"))
     almost = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
-    assert not any("recorded only" in note for note in almost.get("notes", ()))
+    assert "recorded only" not in str(almost.get("notes"))
 
 
 BEGIN = 1_784_000_000
@@ -295,7 +295,7 @@ def times(value: Any) -> Iterator[float]:
 @pytest.fixture
 def from_zero(tmp_path: Path) -> Path:
     for split in range(2):
-        messages = [odom((split * 5 + n) * S, n * 0.1, 0.0) for n in range(5)]
+        messages = [odom((split * 5 + n) * S, n * 0.1) for n in range(5)]
         messages.append(boolean(split * 5 * S, True))
         messages.append(detections(split * 5 * S, ["cup"]))
         write_mcap(tmp_path / "rec" / f"rec_{split}.mcap", messages)

@@ -131,7 +131,7 @@ def test_the_path_of_loose_bags_that_overlap_at_their_ends_is_that_of_the_first(
     for number, robot in enumerate(("red", "blue")):
         write_mcap(tmp_path / f"{robot}.mcap", drive(10.0 * number, begin=55 * number))
     answer = driven(memory_of(tmp_path), 0, 59)
-    assert any("the path there is that of red" in note for note in answer["notes"])
+    assert "the path there is that of red" in str(answer["notes"])
     assert {point["x"] for point in answer["waypoints"]} == {0.0}
 
 
@@ -151,7 +151,7 @@ def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, objec
 
 def driving(begin: int, stop: int, x: float) -> list[Msg]:
     """Poses from a second to another, 0.5 m/s along x from a place."""
-    return [odom(T0 + n * S, x + (n - begin) / 2, 0.0) for n in range(begin, stop + 1)]
+    return [odom(T0 + n * S, x + (n - begin) / 2) for n in range(begin, stop + 1)]
 
 
 @pytest.mark.parametrize("fills", [False, True])
@@ -192,12 +192,12 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     assert warned(memory) == []
     told = driven(memory, 95, 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
-    assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
+    assert "run_1 and run_2 have different messages" in str(told["notes"])
     # What lies in a time that the recording had before is left out, and nothing is a jump back.
     for known in (memory, with_store(memory, tmp_path)):
         whole = driven(known, 0, 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
-        assert any("run_1 has the time from" in each for each in whole["notes"])
+        assert "run_1 has the time from" in str(whole["notes"])
         for at, is_twice in ((50, True), (150, False)):
             there = asked(known, "get_position_at", timestamp=T0_S + at)
             assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
@@ -281,7 +281,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
     tmp_path: Path, kind: str
 ) -> None:
     """100 s at 0.5 m/s; after 50 s the clock is set back by 30 s."""
-    poses = [odom(T0 + n * S // 10, n / 20, 0.0) for n in range(1000)]
+    poses = [odom(T0 + n * S // 10, n / 20) for n in range(1000)]
     logged = [
         replace(pose, log_time=pose.log_time - 30 * S * (n >= 500)) for n, pose in enumerate(poses)
     ]
@@ -298,11 +298,11 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         path = driven(memory, 0, 70)
         assert path["distance_m"] == pytest.approx(20.0, abs=1.2)
         assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
-        assert any("run has the time from" in note for note in path["notes"])
+        assert "run has the time from" in str(path["notes"])
         # At log time 40 it was at x = 20 m and, 30 s later, at x = 35 m.
         visits = asked(memory, "visits", x=35.0, y=0.0, radius_m=1.0)
         assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
-        assert any("run has the time from" in note for note in visits["notes"])
+        assert "run has the time from" in str(visits["notes"])
 
 
 @pytest.mark.parametrize("resting", [1, 20])
@@ -311,7 +311,7 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
 ) -> None:
     for speed in (1.0, 2.0):
         name, times = f"run_{speed:.0f}", range(S, 61 * S, S)
-        poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
+        poses = [odom(at, max(n - resting + 1, 0) * speed) for n, at in enumerate(times)]
         write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
     memory = memory_of(tmp_path)
     (note,) = warned(memory)

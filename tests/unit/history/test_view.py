@@ -50,7 +50,7 @@ def test_a_bag_that_fails_is_named_and_the_others_still_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, at in (("a", T0), ("b", T0 + 60 * S)):
-        write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(at, 0, 0)])
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(at)])
     failure = BagError("a_0.mcap", "the disk returned an error")
     fail_reading(
         monkeypatch, "records", lambda path: failure if path.name == failure.path else None
@@ -114,7 +114,7 @@ def write_splits(
             for log_time, was, text in messages
             if begin <= log_time < begin + SPLIT
         ]
-        poses = [odom(begin, 0.0, 0.0), odom(min(begin + SPLIT - 1, stop), 1.0, 0.0)]
+        poses = [odom(begin), odom(min(begin + SPLIT - 1, stop), 1.0)]
         write_mcap(folder / f"{folder.name}_{nth}.mcap", [*inside, *poses], LAYOUT)
 
 
@@ -270,7 +270,7 @@ def _message(draw: Random, kind: int, at: int) -> Msg:
     if kind == 3:
         label, score = draw.choice(["cup", "dog"]), draw.choice([0.1, 0.5])
         return text(at, f'[{{"label": "{label}", "score": {score}}}]', "/json")
-    return odom(at, draw.choice([-1.0, 1.0, 1.0]), 0.0)
+    return odom(at, draw.choice([-1.0, 1.0, 1.0]))
 
 
 def _published(draw: Random, start: int, stop: int) -> list[Msg]:
@@ -280,7 +280,7 @@ def _published(draw: Random, start: int, stop: int) -> list[Msg]:
         at = T0 + start * S
         while (at := at + draw.choice([1, 2, 5, 5, 10, 30, 110]) * 100 * MS) < T0 + stop * S:
             found.append(replace(_message(draw, kind, at), publish_time=at))
-    return found or [odom(T0 + start * S, 0, 0)]
+    return found or [odom(T0 + start * S)]
 
 
 def draw_recordings(draw: Random) -> dict[str, list[Msg]]:

@@ -23,7 +23,7 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
             each
             for at in range(begin, begin + 10)
             for each in (
-                odom((T0 + at) * S, float(at), 0.0),
+                odom((T0 + at) * S, float(at)),
                 tf((T0 + at) * S, transform((T0 + at) * S, "odom", "base_link", (at, 0.0, 0.0))),
                 detections((T0 + at) * S, ["cup"]),
             )
@@ -54,8 +54,8 @@ def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory) -> None:
 
 
 def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
-    messages = [odom((T0 + at) * S, float("nan"), 0.0) for at in range(3)]
-    messages.append(odom((T0 + 3) * S, 1.0, 0.0))
+    messages = [odom((T0 + at) * S, float("nan")) for at in range(3)]
+    messages.append(odom((T0 + 3) * S, 1.0))
     write_mcap(tmp_path / "a" / "a_0.mcap", messages)
     memory = memory_of(tmp_path)
     told = asked(memory, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
@@ -72,7 +72,7 @@ BEGIN = 1_784_000_000 * S
 def test_a_window_with_too_many_messages_to_read_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)])
+    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, n) for n in range(9)])
     window = {"start": BEGIN / S, "end": BEGIN / S + 100, "fields": ["pose.covariance"]}
     memory = memory_of(tmp_path)
     whole = asked(memory, "get_topic_in_range", topic="/odom", **window)

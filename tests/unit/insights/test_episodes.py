@@ -37,9 +37,9 @@ def written(folder: Path, *, stored: bool = False) -> Memory:
     """Bags with a beat every two seconds, and nothing between 320 and 900 s."""
     said = [text((BEGIN + at) * S, words, "/task") for at, words in TASKS]
     said += [text((BEGIN + at) * S, words, "/action") for at, words in ACTIONS]
-    beats = [odom((BEGIN + at) * S, at / 100, 0.0) for at in range(0, 321, 2)]
+    beats = [odom((BEGIN + at) * S, at / 100) for at in range(0, 321, 2)]
     beats += [boolean((BEGIN + at) * S, data=at >= 100, topic="/docked") for at in range(0, 320, 2)]
-    later = [odom((BEGIN + at) * S, 0.0, 0.0) for at in range(900, 940, 2)]
+    later = [odom((BEGIN + at) * S) for at in range(900, 940, 2)]
     later.insert(5, text((BEGIN + 909) * S, "rest", "/task"))
     write_splits(folder, [*said, *beats], 100, "a")
     write_mcap(folder / "c" / "c_0.mcap", later)

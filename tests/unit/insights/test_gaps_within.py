@@ -28,9 +28,7 @@ def at_rates(slow: Sequence[tuple[float, float]] = ()) -> list[Msg]:
         return BEGIN * S + round(t * S)
 
     fast = [*STALLS, *slow]
-    messages = [
-        odom(at(n / 200), n / 200, 0.0) for n in range(200 * LENGTH) if is_on(n / 200, fast)
-    ]
+    messages = [odom(at(n / 200), n / 200) for n in range(200 * LENGTH) if is_on(n / 200, fast)]
     flags = [n / 50 + 0.001 for n in range(50 * LENGTH)]
     messages += [boolean(at(t), data=True) for t in flags if is_on(t, fast)]
     texts = [n / 10 + 0.001 for n in range(10 * LENGTH)]

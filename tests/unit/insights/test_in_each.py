@@ -117,7 +117,7 @@ def test_what_none_of_the_hours_have_is_said_as_it_is_without_them(
     assert reply["reason"] == "topic_not_recorded"
     assert "similar: /chatter" in reply["detail"]
     cups = {"topic": "/cups", "between": "23:59-00:02"}
-    write_mcap(folder.parent / "more" / "rec" / "rec_0.mcap", [odom((BEGIN + 60) * S, 0.0, 0.0)])
+    write_mcap(folder.parent / "more" / "rec" / "rec_0.mcap", [odom((BEGIN + 60) * S)])
     write_mcap(folder.parent / "more" / "b" / "b_0.mcap", [text((BEGIN + 600) * S, "x", "/cups")])
     more = memory_of(folder.parent / "more")
     reply = asked(more, "get_topic_in_range", **cups, **SPAN)

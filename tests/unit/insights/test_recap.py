@@ -93,7 +93,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     for step in range(700):
         seconds = step / 10
         stood = min(max(seconds - 20, 0), 10) + min(max(seconds - 50, 0), 10)
-        messages.append(odom(BEGIN + step * S // 10, seconds - stood - 16, 0.0))
+        messages.append(odom(BEGIN + step * S // 10, seconds - stood - 16))
         if step % 10 == 0:
             bump = int(seconds) in {18, 45}
             messages.append(boolean(BEGIN + step * S // 10, bump, topic="/bumper"))
@@ -131,7 +131,7 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     """A robot that drives at 0.5 m/s, recorded for 20 s, an hour later, and another hour later."""
     for run in range(3):
         begin = BEGIN + run * 3600 * S
-        body = [odom(begin + n * S // 10, n * 0.05, 0.0, 0.0) for n in range(200)]
+        body = [odom(begin + n * S // 10, n * 0.05) for n in range(200)]
         body += [boolean(begin + n * S, n < 5, "/bumper") for n in range(20)]
         write_mcap(tmp_path / f"run{run}" / f"run{run}_0.mcap", body)
     memory, window = memory_of(tmp_path), {"start": BEGIN / S, "end": BEGIN / S + 7220}
@@ -158,7 +158,7 @@ def at(seconds: float) -> int:
 def driving(until: int, stops: float) -> list[Msg]:
     """Drives 0.4 m/s up to a time, and then stands."""
     times = [nth / 10 for nth in range(until * 10)]
-    return [odom(at(t), 0.4 * min(t, stops), 0.0, 0.0) for t in times]
+    return [odom(at(t), 0.4 * min(t, stops)) for t in times]
 
 
 def before(memory: Memory, around: float, **given: float) -> dict[str, Any]:
@@ -240,7 +240,7 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
     layout = McapLayout(latched=frozenset({"/docked", "/drive/_action/status"}))
     said = [boolean(at(50), True, "/docked"), boolean(at(50), True), goals(at(50), {1: 2})]
     write_splits(tmp_path, [*driving(60, 60), *said], name="first", layout=layout)
-    later = [odom(at(600 + t), 24.0, 0.0) for t in range(60)]
+    later = [odom(at(600 + t), 24.0) for t in range(60)]
     later += [command(at(600 + t), 0.4 if t < 40 else 0.0) for t in range(30, 60)]
     later += [goals(at(601), {1: 2})] * listed_again
     write_splits(tmp_path, later, name="second", layout=layout)
@@ -253,7 +253,7 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
 def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_path: Path) -> None:
     said = [boolean(at(t), value, "/docked") for t, value in ((0, True), (7200, False))]
     said.append(goals(at(0), {1: 2}))
-    beats = [odom(at(t), 0.0, 0.0) for t in range(0, 7300, 10)]
+    beats = [odom(at(t)) for t in range(0, 7300, 10)]
     layout = McapLayout(latched=frozenset({"/docked", "/drive/_action/status"}))
     write_splits(tmp_path, [*said, *beats], 1000, layout=layout)
     memory = memory_of(tmp_path)
@@ -320,7 +320,7 @@ TORN = Msg(TOPIC, DAY[0].type, BEGIN + 20 * S, b"\x00\x01\x00\x00\xff\xff\xff\x7
 def test_what_a_window_first_lists_as_ended_just_did_if_the_message_before_it_is_known(
     tmp_path: Path, before: list[Msg], pause: range, is_told: bool
 ) -> None:
-    beats = [odom(BEGIN + at * S + 1, 0.0, 0.0) for at in range(60) if at not in pause]
+    beats = [odom(BEGIN + at * S + 1) for at in range(60) if at not in pause]
     messages = [*beats, *before, *history((42, {1: 4, 2: 6}))]
     messages.sort(key=lambda message: message.log_time)
     found = told_goals(tmp_path, messages, 35, 52, 5, recalls=False)
@@ -381,13 +381,13 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     tmp_path: Path,
 ) -> None:
     """Active from 10 to 40 s (34:00), another from 60 s on, which a restart at 99 s cuts short."""
-    beats = [odom(BEGIN + at * S, at / 10, 0.0) for at in range(100)]
+    beats = [odom(BEGIN + at * S, at / 10) for at in range(100)]
     told_goals = history((10, {1: 2}), (40, {1: 4}), (60, {1: 4, 2: 2}))
     layout = McapLayout(latched=frozenset({TOPIC}))
     write_splits(
         tmp_path, sorted([*beats, *told_goals], key=lambda one: one.log_time), layout=layout
     )
-    beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(900, 950)]
+    beats = [odom(BEGIN + at * S) for at in range(900, 950)]
     write_splits(tmp_path, beats, name="next")
     memory = memory_of(tmp_path)
 
@@ -453,7 +453,7 @@ def test_however_the_history_is_cut_the_same_is_told(
 
 
 def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
-    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0) for at in range(40)]
     write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
     for end, goes_on in ((15, True), (40, False), (60, False)):
         events = over(memory_of(tmp_path), 0, end).events

@@ -88,7 +88,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         for pair in [("map", "odom"), ("odom", "base_link")]
     ]
     seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
-    poses = [odom(BEGIN + at * S, 0.5 * at, 0.0) for at in range(3)]
+    poses = [odom(BEGIN + at * S, 0.5 * at) for at in range(3)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
     memory = memory_of(tmp_path)
     for frame_id in (None, "odom"):
@@ -97,11 +97,11 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         assert sighting.last == late
         assert sighting.thing is not None
         assert sighting.thing.frame_id == (frame_id or "map")
-        assert not any("is in base_link" in note for note in answer.notes)
+        assert "is in base_link" not in str(answer.notes)
     far = [detections(late + at * S, ["cup"]) for at in range(6, 8)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *poses, *far])
     answer = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "cup")
-    assert any("no transform leads to map" in note for note in answer.notes)
+    assert "no transform leads to map" in str(answer.notes)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_al
     tmp_path: Path,
 ) -> None:
     times = [BEGIN + t * S for t in range(60)]
-    driven = [odom(at, float(at // S % 10), 0.0) for at in times]
+    driven = [odom(at, float(at // S % 10)) for at in times]
     write_splits(tmp_path, [*driven, *(text(at + 1, "calm", topic="/mood") for at in times)])
     memory = memory_of(tmp_path)
     calm = [WhileCondition("/mood", "equals", "calm")]
@@ -167,7 +167,7 @@ def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_al
         if answer is not None:
             whole = table(as_json(answer, tmp_path))["all"]
             assert whole["seconds"] == whole["count"] * 4 - 1
-            is_partial = any("is counted: out of time" in note for note in answer.notes)
+            is_partial = "is counted: out of time" in str(answer.notes)
             assert (whole["count"] == 6) != is_partial
     # Once no time was left for the end of the newest one.
     assert answered[answered.index(True) :].count(False) <= 1
@@ -189,8 +189,8 @@ def test_a_damaged_bag_between_the_oldest_sightings_is_noted_where_time_is_over(
         )
     ):
         if answer is not None and answer.sightings[0].first < BEGIN + 30 * S:
-            assert any("damaged" in note for note in answer.notes)
-            spanned += any("ran out of time" in note for note in answer.notes)
+            assert "damaged" in str(answer.notes)
+            spanned += "ran out of time" in str(answer.notes)
     assert spanned
 
 
@@ -265,7 +265,7 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
 def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     tmp_path: Path, name: str, more: dict[str, str]
 ) -> None:
-    write_splits(tmp_path, [odom(BEGIN, 0.0, 0.0), boolean(BEGIN, True)])
+    write_splits(tmp_path, [odom(BEGIN), boolean(BEGIN, True)])
     memory = memory_of(tmp_path)
     asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
     topic = "condition_topic" if "value_topic" in more else "topic"

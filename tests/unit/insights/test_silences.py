@@ -25,7 +25,7 @@ BLIND = range(10, 19)
 @pytest.fixture(scope="module", params=[False, True], ids=["without catalogue", "with catalogue"])
 def memory(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     tmp_path = tmp_path_factory.mktemp("bags")
-    messages = [odom(BEGIN * S + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLITS * SPLIT)]
+    messages = [odom(BEGIN * S + at * S // 2) for at in range(2 * SPLITS * SPLIT)]
     messages.append(boolean((BEGIN + 251) * S, data=True))
     for at in range(SPLITS * SPLIT):
         if at // SPLIT not in BLIND:
@@ -82,7 +82,7 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
 ) -> None:
     """What was deleted of a topic is read once, and for a window without its silences never."""
     silent = {"/early": [(60, 160), (320, 420)], "/late": [(80, 170), (330, 430)]}
-    messages = [odom((BEGIN + at) * S, 0.0, 0.0, 0.0) for at in range(600)]
+    messages = [odom((BEGIN + at) * S) for at in range(600)]
     for nth, (topic, spans) in enumerate(silent.items()):
         heard = (at for at in range(600) if not any(start <= at < end for start, end in spans))
         messages += [boolean((BEGIN + at) * S + nth, data=True, topic=topic) for at in heard]

@@ -34,7 +34,7 @@ BEGIN = 1_784_000_000 * S
 
 
 SOUND = "no loss or fault was found"
-DRIVEN = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)]
+DRIVEN = [odom(BEGIN + t * S) for t in range(50)]
 
 
 def remembering(
@@ -56,7 +56,7 @@ def shown(memory: Memory) -> dict[str, Any]:
 
 def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> None:
     """The robot died at 10 s, and the recorder logs each split that it opens."""
-    driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(11)]
+    driven = [odom(BEGIN + t * S) for t in range(11)]
     splits = [log_entry(BEGIN + t * S, 20, "rosbag2_recorder", "opened") for t in range(0, 60, 10)]
     memory = remembering(tmp_path, [*driven, *splits])
     assert shown(memory)["newest_age_s"] == 10.0  # of whoever recorded this
@@ -65,7 +65,7 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
     assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
     ahead = BEGIN + 365 * 86_400 * S
-    write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead, 0.0, 0.0, 0.0)])
+    write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead)])
     assert shown(memory)["newest_age_s"] == 50.0
 
 
@@ -129,7 +129,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
         recap = asked(memory, "recap", **window)
         assert [note for note in recap.get("notes", ()) if after in note] == notes
     (tmp_path / "later").mkdir()
-    messages = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(55, 60)]
+    messages = [odom(BEGIN + t * S) for t in range(55, 60)]
     write_mcap(tmp_path / "later" / "later_0.mcap", messages)
     memory.index.refresh()
     assert after not in shown(memory)["doubts"]
@@ -172,7 +172,7 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     bumps = [boolean(BEGIN + t * S, True) for t in range(80)]
     write_mcap(tmp_path / "a" / "a_0.mcap", bumps)
     again = bumps[-1].log_time + LONGEST_OFF_NS + later
-    poses = [odom(again + t * S, 0.0, 0.0, 0.0) for t in range(80)]
+    poses = [odom(again + t * S) for t in range(80)]
     write_mcap(tmp_path / "b" / "b_0.mcap", poses)
     answer = memory_status(memory_of(tmp_path), Call())
     assert [each.topic for each in answer.fell_silent] == fell
@@ -190,7 +190,7 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
 def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     tmp_path: Path, fills: bool
 ) -> None:
-    driven = [odom(BEGIN + t * S // 10, t / 20, 0.0) for t in range(100)]
+    driven = [odom(BEGIN + t * S // 10, t / 20) for t in range(100)]
     bag = write_mcap(tmp_path / "rec" / "rec_0.mcap", driven, McapLayout(chunk_size=3000))
     spoil_chunk(bag, 3)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S))
@@ -210,7 +210,7 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
 def recording(folder: Path, *listed: tuple[str, int]) -> None:
     """Two splits of five messages each, and a metadata.yaml that lists those given."""
     for split in range(2):
-        messages = [odom(BEGIN + (10 * split + t) * S, 0.0, 0.0) for t in range(5)]
+        messages = [odom(BEGIN + (10 * split + t) * S) for t in range(5)]
         write_mcap(folder / f"rec_{split}.mcap", messages)
     names = "".join(f"  - {name}\n" for name, _ in listed)
     files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)
@@ -222,7 +222,7 @@ def recording(folder: Path, *listed: tuple[str, int]) -> None:
 
 
 def test_a_file_without_an_end_may_be_being_written_or_left_by_a_crash(tmp_path: Path) -> None:
-    messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
+    messages = [odom(BEGIN + t * S) for t in range(9)]
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     content = path.read_bytes()[:-100]
     path.write_bytes(content)

@@ -170,7 +170,7 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
     tmp_path: Path, during: dict[str, object], said: str, *, recalls: bool
 ) -> None:
     said_then = [
-        odom(MAP_BEGIN, 0.0, 0.0),
+        odom(MAP_BEGIN),
         octets(MAP_BEGIN, [1] * 60),
         boolean(MAP_BEGIN, True, topic="/dock"),
     ]

@@ -35,7 +35,7 @@ def line(*legs: tuple[float, float], begin: float = 0.0) -> list[Msg]:
     messages, x = [], 0.0
     for length, speed in legs:
         for _ in range(round(length * 5)):
-            messages.append(odom(BEGIN + round(begin * S), x, 0.0, 0.0))
+            messages.append(odom(BEGIN + round(begin * S), x))
             begin += 0.2
             x += speed * 0.2
     return messages
@@ -78,11 +78,11 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert answer.frame_id == ("map" if in_map else "odom")
     assert [each.restarts for each in answer.visits] == [0, int(not in_map)]
-    assert any("odometry restarted" in note for note in answer.notes) is not in_map
+    assert ("odometry restarted" in str(answer.notes)) is not in_map
     assert visits(with_store(memory, tmp_path), Call(), 0.0, 0.0, radius_m=1.0) == answer
     driven = asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 1100)
-    assert any("odometry restarted" in note for note in driven["notes"])
-    assert not any("of the jumps" in note for note in driven["notes"])
+    assert "odometry restarted" in str(driven["notes"])
+    assert "of the jumps" not in str(driven["notes"])
 
 
 def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     assert all('with frame_id "odom"' in str(each) for each in replies)
     for other in ({"frame_id": "odom"}, {"frame_id": "map", "x": 900.0}, {"x": 50.0, "y": 1.0}):
         found = visits(memory, Call(), **pasted | other)
-        assert not any("were taken in" in note for note in found.notes)
+        assert "were taken in" not in str(found.notes)
 
 
 def walk(draw: random.Random, count: int, step: float) -> list[tuple[int, float, float]]:
@@ -136,7 +136,7 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
     assume(any(start * S <= t <= end * S for t, _, _ in poses))
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
-        plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
+        plain = remembering(bag_dir, [odom(t, x, y) for t, x, y in poses], split_s=split_s)
         known = with_store(plain, bag_dir)
         place: dict[str, Any] = {"radius_m": 1.0, "limit": 100}
         every = visits(plain, Call(), 0.0, 0.0, **place).visits
@@ -186,7 +186,7 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
     draw = random.Random(3)
     edge = [(BEGIN + n * S // 5, 1.0 + draw.uniform(-0.01, 0.01)) for n in range(600)]
     there = [(BEGIN + n * S // 5 - 20 * S, 5.0 - n * 0.04) for n in range(100)]
-    messages = [odom(at, x, 0.0, 0.0) for at, x in (*there, *edge)]
+    messages = [odom(at, x) for at, x in (*there, *edge)]
     found = visits(remembering(tmp_path, messages), Call(), 0.0, 0.0, radius_m=1.0)
     inside = [at for at, x in edge if x <= 1.0]
     assert [(one.arrived, one.departed) for one in found.visits] in (
@@ -210,7 +210,7 @@ def life(seconds: int, silent: Mapping[str, Sequence[tuple[float, float]]] | Non
     messages: list[Msg] = []
     for step in range(seconds * 5):
         at = T0 * S + step * S // 5
-        messages.append(odom(at, 0.0, 0.0))
+        messages.append(odom(at))
         if step % 5 == 0:
             messages += [boolean(at, True), text(at, "calm", topic="/mood")]
     return [

@@ -64,8 +64,8 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     write_splits(tmp_path / "two", later, name="second")
     reply = ask_compare(tmp_path / "two", **EARLIER, **LATER)
     assert "stood_at" not in reply
-    assert any("changes with every start" in note for note in reply["notes"])
-    assert any("from one run of odometry to another" in note for note in reply["notes"])
+    assert "changes with every start" in str(reply["notes"])
+    assert "from one run of odometry to another" in str(reply["notes"])
     # It was seen in both windows, so that one was not "not looked at".
     [book] = reply["things"]["not_comparable"]
     assert labels(reply) == {"not_comparable": ["book"]}
@@ -74,7 +74,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     reply = ask_compare(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
-    assert not any("from one run" in note for note in reply.get("notes", ()))
+    assert "from one run" not in str(reply.get("notes"))
 
 
 def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     assert note.startswith(f"things are not compared after {BEGIN + 50}")
     until_its_end = ask_compare(tmp_path, **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
-    assert not any("things" in each for each in until_its_end["notes"])
+    assert "things" not in str(until_its_end["notes"])
 
 
 DAY: Final = 86_400
@@ -229,7 +229,7 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     reply = ask(tmp_path, "compare", start=BEGIN + 90, end=BEGIN + stop, **windows)
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
-    assert any("localisation was poor" in note for note in reply.get("notes", [])) == is_poor
+    assert ("localisation was poor" in str(reply.get("notes"))) == is_poor
 
 
 @each_way

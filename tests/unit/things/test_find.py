@@ -124,7 +124,7 @@ def test_things_of_two_robots_at_once_are_said_to_be_mixed(tmp_path: Path, topic
         own = [message for message in seen if topic == "/odom" or message.topic != "/odom"]
         write_splits(tmp_path, own, name=name)
     notes = ask(tmp_path)["notes"]
-    assert any(f"2 recordings have different messages on {topic} at" in note for note in notes)
+    assert f"2 recordings have different messages on {topic} at" in str(notes)
 
 
 CUP_AS_JSON = json.dumps(
@@ -367,7 +367,7 @@ def test_a_place_in_a_frame_in_which_nothing_is_known_is_named(tmp_path: Path) -
     windows = {"start": BEGIN, "end": BEGIN + 5, "with_start": BEGIN + 5, "with_end": BEGIN + 10}
     memory = memory_of(tmp_path, limits=NAMED)
     compared = asked(memory, "compare", where="kitchen", **windows)
-    assert any("kitchen is in map" in note for note in compared["notes"])
+    assert "kitchen is in map" in str(compared["notes"])
     assert "notes" not in ask(tmp_path)
 
 
@@ -501,7 +501,7 @@ def test_things_farther_than_any_place_are_not_placed_and_others_are(
     messages: list[Msg] = []
     for at in range(BEGIN * S, (BEGIN + 20) * S, S):
         seen = [("mug", 0.9, (far, 0.0, 0.0)), ("cup", 0.9, (1.0, 0.0, 0.0))]
-        messages += [odom(at, 0.0, 0.0), tf(at, base(at, 0.0, 0.0, 0.0)), detected(at, seen)]
+        messages += [odom(at), tf(at, base(at, 0.0, 0.0, 0.0)), detected(at, seen)]
     write_splits(tmp_path, messages)
     reply = ask(tmp_path, QuerySettings())
     assert reply["labels"] == {"cup": 1}
