@@ -17,6 +17,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from tests.support import bags
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -36,17 +37,15 @@ from tests.support.memories import asked, each_way, memory_of
 S = 10**9
 
 T0_S = 1_784_023_200
-
 T0 = T0_S * S
-
 HOUR = 3600 * S
-
 LOST = "1 bag file could not be read and may hold more: rec/rec_1.mcap"
 
 
-def messages(start_s: int, seconds: int = 10) -> list[Msg]:
+def messages(start_s: int) -> list[Msg]:
+    """Of ten seconds."""
     made: list[Msg] = []
-    for second in range(start_s, start_s + seconds):
+    for second in range(start_s, start_s + 10):
         at = T0 + second * S
         made += [
             odom(at, second * 0.1),
@@ -56,10 +55,10 @@ def messages(start_s: int, seconds: int = 10) -> list[Msg]:
     return [*made, detections(T0 + start_s * S, ["cup"])]
 
 
-def write_splits(bag_dir: Path, count: int, folder: str = "rec") -> list[Path]:
+def write_splits(bag_dir: Path, count: int) -> list[Path]:
     paths = []
     for number in range(count):
-        path = bag_dir / folder / f"{folder}_{number}.mcap"
+        path = bag_dir / "rec" / f"rec_{number}.mcap"
         paths.append(write_mcap(path, messages(number * 10), McapLayout(chunk_size=2000)))
         os.utime(path, ns=(T0 + number * 10 * S + 10 * S,) * 2)
     return paths
@@ -71,30 +70,21 @@ def tear(path: Path, at: int = T0) -> None:
     os.utime(path, ns=(at, at))
 
 
-def notes_of(reply: Any) -> list[str]:
-    return list(reply.get("notes", ())) if isinstance(reply, dict) else []
-
-
 def at(second: float) -> float:
     return T0_S + second
 
 
-FULL: dict[str, Any] = {"start": at(0), "end": at(29)}
-
+Question = tuple[str, dict[str, Any]]
+FULL = {"start": at(0), "end": at(29)}
 NEAR: dict[str, Any] = {"topic": "/odom", "condition_type": "near_position"}
-
 FAR: dict[str, Any] = {**NEAR, "value": {"x": 500, "y": 0}}
-
-SCISSORS: dict[str, Any] = {"condition_type": "contains", "value": "scissors"}
-
+SCISSORS = {"condition_type": "contains", "value": "scissors"}
 SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
-
 BASE = {"parent": "odom", "child": "base_link"}
 
-TOUCHING: list[tuple[str, dict[str, Any]]] = [
+TOUCHING: list[Question] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": at(15), "tolerance_s": 30}),
     ("get_topic_at_time", {"topic": "/nowhere", "timestamp": at(5)}),
-    ("get_topic_in_range", {"topic": "/odom", "start": at(5), "end": at(25)}),
     ("get_topic_in_range", {"topic": "/odom", "start": at(12), "end": at(15)}),
     ("get_topic_in_range", {"topic": "/bumper", **FULL, "changes": True}),
     ("get_topic_in_range", {"topic": "/bumper", **FULL, "by": "value"}),
@@ -124,7 +114,7 @@ TOUCHING: list[tuple[str, dict[str, Any]]] = [
     ("compare", {"start": at(12), "end": at(29), "with_start": at(0), "with_end": at(9)}),
 ]
 
-APART: list[tuple[str, dict[str, Any]]] = [
+APART: list[Question] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": at(5)}),
     ("get_topic_in_range", {"topic": "/odom", "start": at(0), "end": at(9)}),
     ("get_position_at", {"timestamp": at(25)}),
@@ -150,8 +140,7 @@ def torn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
     tool: str, given: dict[str, Any], torn: Memory
 ) -> None:
-    told = notes_of(asked(torn, tool, **given))
-    assert any(note.startswith(LOST) for note in told), told
+    assert LOST in str(asked(torn, tool, **given)["notes"])
 
 
 @pytest.mark.parametrize(("tool", "given"), APART)
@@ -160,7 +149,7 @@ def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
 ) -> None:
     reply = asked(torn, tool, **given)
     assert reply is None or "error" not in reply
-    assert "could not be read" not in str(notes_of(reply))
+    assert "could not be read" not in str(reply)
 
 
 def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_future_is(
@@ -199,19 +188,13 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     paths[2].write_bytes(paths[2].read_bytes()[:6000])
     os.utime(paths[2], ns=(T0 + 32 * S,) * 2)
     memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    [told] = asked(memory, "get_topic_in_range", topic="/odom", start=at(1), end=at(31))["notes"][
-        :1
-    ]
+    window = {"topic": "/odom", "start": at(1), "end": at(31)}
+    told = asked(memory, "get_topic_in_range", **window)["notes"][0]
     assert told.startswith("1 unfinished bag; its readable part is used: rec/rec_2.mcap (")
     [named] = asked(memory, "data_time_range")["incomplete"]
     assert named["file"] == "rec/rec_2.mcap"
     rows = queries.list_recorded_topics(memory, Call())
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
-
-
-OBJECTS = "/vision/scene/scene_objects"
-
-CUP = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
 
 
 def write_protobuf(path: Path, topics: int) -> None:
@@ -281,16 +264,14 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     cut_off = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
     kind = "ros2_vision_interfaces/msg/VisionDetectionArray"
     messages = [
-        Msg(OBJECTS, kind, T0 + n * S, cut_off)
+        Msg("/vision/scene/scene_objects", kind, T0 + n * S, cut_off)
         if n in damaged
         else detections(T0 + n * S, ["cup"] if n < 20 else ["table"])
         for n in range(30)
     ]
-    for nth in range(3):
-        path = tmp_path / "rec" / f"rec_{nth}.mcap"
-        write_mcap(path, messages[10 * nth : 10 * nth + 10])
+    bags.write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, recalls=recalls)
-    reply = asked(memory, "find_matches", **CUP)
+    reply = asked(memory, "find_matches", **SEEN)
     seen = [n for n in range(20) if n not in damaged]
     [sighting] = reply["sightings"]
     assert (sighting["first_seen"], sighting["last_seen"]) == (T0_S + seen[0], T0_S + seen[-1])
@@ -341,16 +322,15 @@ def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
 
 
-def sentences(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
-    window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
+def sentences(snapshot: Snapshot, start: int, stop: int, *, nothing: bool = False) -> list[str]:
+    window = TimeWindow(T0 + start * S, T0 + stop * S)
     odd = snapshot.timeline.faulty(window)
-    return list(unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd))
+    return [*unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd)]
 
 
 def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:
     active = SetAside(Path("/b/copied/copied_0.db3"), "still being written")
-    timeline = Timeline.of((listed(0), listed(1)))
-    snapshot = Snapshot(timeline, active=(active,), scanned_at=T0 + 3 * DAY)
+    snapshot = Snapshot(Timeline.of([listed(0)]), active=(active,), scanned_at=T0 + 72 * HOUR)
     assert sentences(snapshot, 0, 9) == []
     named = ["still being written and not included: copied/copied_0.db3"]
     assert sentences(snapshot, 0, 9, nothing=True) == named
@@ -366,8 +346,8 @@ def test_what_is_reported_stays_short_however_much_was_lost(
     lost: set[int], reason: str, window: tuple[int, int], nothing: bool
 ) -> None:
     asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))
-    bags = tuple(listed(n, notes=(reason,)) for n in range(41) if n not in lost)
-    snapshot = Snapshot(Timeline.of(bags), damaged=asides, scanned_at=T0 + DAY)
+    timeline = Timeline.of(tuple(listed(n, (reason,)) for n in range(41) if n not in lost))
+    snapshot = Snapshot(timeline, damaged=asides, scanned_at=T0 + 24 * HOUR)
     told = sentences(snapshot, *sorted(window), nothing=nothing)
     assert len(told) <= 5
     assert sum(map(len, told)) < 2000
@@ -405,4 +385,4 @@ def test_a_reply_names_the_damage_of_its_window_alone(
         window = {"start": T0_S + start, "end": T0_S + start + 12}
         reply = asked(memory, tool, **given, **window)
         assert "error" not in reply
-        assert ("could not be read whole" in str(notes_of(reply))) == is_named
+        assert ("could not be read whole" in str(reply)) == is_named
