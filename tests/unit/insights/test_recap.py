@@ -1,7 +1,6 @@
 """What happened in a time, what became of goals, what changed before and after a moment."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
@@ -12,14 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import FLAG, MOST
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
-from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.core.regions import Place, Rectangle
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
-from ros2_memory.insights.sightings import find_matches
-from ros2_memory.results import Event, Recap
+from ros2_memory.results import Recap
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -36,7 +33,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -51,13 +48,11 @@ def over(memory: Memory, begin: float, end: float) -> Recap:
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
     type_name = "px4_msgs/msg/ManyFlags"
     body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
-    write_splits(tmp_path, [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)])
-    memory = memory_of(tmp_path)
-    [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
+    many = [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
     more = 600 - MOST[FLAG]
-    assert note == (
+    assert (
         f"/many has too many booleans or things in one message: {more} more are not followed"
-    )
+    ) in over(remembered(tmp_path, many), 0, 10).notes
 
 
 def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) -> None:
@@ -75,18 +70,6 @@ def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) 
     assert (stop.end - BEGIN) / S == pytest.approx(13, abs=0.1)
 
 
-PLACES = (
-    Place("room", "map", Rectangle(-1, 5, -1, 4)),
-    Place("corner", "map", Circle(0.0, 3.0, 0.5)),
-    Place("elsewhere", "map", Rectangle(50, 51, 50, 51)),
-)
-
-
-def in_places(memory: Memory, frame_id: str = "map") -> Memory:
-    places = tuple(replace(each, frame_id=frame_id) for each in PLACES)
-    return replace(memory, limits=replace(memory.limits, places=places))
-
-
 def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     """Drives 1 m/s through the room and out of it, stands at 20 s and at 50 s, bumps twice."""
     messages = []
@@ -101,8 +84,9 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
             messages.append(detections(BEGIN + step * S // 10, [label]))
         if step in {180, 450, 460}:
             messages.append(log_entry(BEGIN + step * S // 10, 40, "base", "stuck"))
-    write_splits(tmp_path, messages)
-    memory = in_places(memory_of(tmp_path), "odom")
+    room, other = Rectangle(-1, 5, -1, 4), Rectangle(50, 51, 50, 51)
+    places = Place("room", "odom", room), Place("elsewhere", "odom", other)
+    memory = remembered(tmp_path, messages, limits=QuerySettings(places=places))
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
     there = recap(memory, Call(), span, where="room")
     # In the room from x = -1 at 15 s to x = 5 at 31 s.
@@ -212,10 +196,9 @@ def test_what_changed_is_listed_the_nearest_first(bag_dir: Path, recalls: bool) 
 
 def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:
     trembling = [battery(at(t), 0.209 - t * 0.0002 + 0.008 * (-1) ** t) for t in range(60)]
-    write_splits(tmp_path, [*trembling, boolean(at(59), True)])
-    reply = before(memory_of(tmp_path), 60.0, seconds_before=60)
-    below = [each for each in reply["before"] if "fell below" in each["text"]]
-    assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
+    memory = remembered(tmp_path, [*trembling, boolean(at(59), True)])
+    reply = before(memory, 60.0, seconds_before=60)
+    assert str(reply["before"]).count("/battery_state fell below 20%") == 1
 
 
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
@@ -263,22 +246,23 @@ def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_
 
 TOPIC = "/drive/_action/status"
 
-Told = tuple[str, str, float, float | None, bool]
-
 
 def told_goals(
-    bag_dir: Path, messages: list[Msg], begin: float, end: float, cut: int = 10**9, *, recalls: bool
-) -> list[Told]:
+    bag_dir: Path, messages: list[Msg], begin: float, end: float, cut: int = 99, *, recalls: bool
+) -> list[tuple[str, str, float, float | None, bool]]:
+    """Kind, text, first and last second of each goal, and whether it goes on."""
     for number, at in enumerate(range(0, len(messages), cut)):
         write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages[at : at + cut])
-    memory = memory_of(bag_dir, recalls=recalls)
-    found = recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
-    return [row(each) for each in found.events if "goal" in each.kind]
+    events = over(memory_of(bag_dir, recalls=recalls), begin, end).events
+    goals = [each for each in events if "goal" in each.kind]
+    return [
+        (each.kind, each.text, since(each.start), each.end and since(each.end), each.goes_on)
+        for each in goals
+    ]
 
 
-def row(event: Event) -> Told:
-    until = None if event.end is None else (event.end - BEGIN) / S
-    return event.kind, event.text, (event.start - BEGIN) / S, until, event.goes_on
+def since(at: int) -> float:
+    return (at - BEGIN) / S
 
 
 def history(*statuses: tuple[int, Mapping[int, int]]) -> list[Msg]:
@@ -325,56 +309,35 @@ def test_what_a_window_first_lists_as_ended_just_did_if_the_message_before_it_is
     messages.sort(key=lambda message: message.log_time)
     found = told_goals(tmp_path, messages, 35, 52, 5, recalls=False)
     assert [text for _, text, *_ in found] == ["/drive goal aborted after 0 s"] * is_told
-    [*searched] = found_in(memory_of(tmp_path), "equals", "failed", begin=35, end=52)
-    assert [(goal, last) for goal, _, _, last, _ in searched] == [(2, 42)] * is_told
-
-
-Found = tuple[int, str, float, float, bool]
+    window = {"start": BEGIN / S + 35, "end": BEGIN / S + 52}
+    searched = found_in(memory_of(tmp_path), "equals", "failed", **window)
+    assert [(goal, last) for goal, _, _, last in searched] == [(2, 42)] * is_told
 
 
 def found_in(
-    memory: Memory,
-    condition: str,
-    value: JsonValue,
-    field: str | None = None,
-    *,
-    begin: float = 0,
-    end: float = 10**6,
-) -> list[Found]:
-    """The goals that a search finds: number, status, first and last second, whether it began."""
-    found = find_matches(
-        memory,
-        Call(),
-        TOPIC,
-        condition,
-        value,
-        field=field,
-        start_s=BEGIN / S + begin,
-        end_s=BEGIN / S + end,
-        limit=50,
-    )
-    assert found.total == len(found.sightings)
+    memory: Memory, condition: str, value: JsonValue, **more: object
+) -> list[tuple[int, str, float, float]]:
+    """The goals that a search finds: number, status, first and last second."""
+    asks = {"topic": TOPIC, "condition_type": condition, "value": value, "limit": 50}
+    found = asked(memory, "find_matches", **asks, **more)["sightings"]
     return [
         (
-            int(str(each.value["goal"]), 16),
-            str(each.value["status"]),
-            (each.first - BEGIN) / S,
-            (each.last - BEGIN) / S,
-            each.begun,
+            int(each["value"]["goal"], 16),
+            each["value"]["status"],
+            *(each[key] - BEGIN / S for key in ("first_seen", "last_seen")),
         )
-        for each in found.sightings
-        if isinstance(each.value, dict)
+        for each in found
     ]
 
 
 def test_a_search_of_a_window_finds_what_ended_in_it_by_a_status_that_there_is(
     tmp_path: Path,
 ) -> None:
-    write_splits(tmp_path, DAY)
-    found = found_in(memory_of(tmp_path), "equals", "failed", begin=35, end=55)
-    assert found == [(2, "aborted", 42, 42, False)]
-    with pytest.raises(InvalidArgumentsError, match=r"aborted \(0 to 6\), or failed"):
-        found_in(memory_of(tmp_path), "equals", "lost")
+    memory = remembered(tmp_path, DAY)
+    window = {"start": BEGIN / S + 35, "end": BEGIN / S + 55}
+    assert found_in(memory, "equals", "failed", **window) == [(2, "aborted", 42, 42)]
+    lost = asked(memory, "find_matches", topic=TOPIC, condition_type="equals", value="lost")
+    assert "aborted (0 to 6), or failed" in lost["detail"]
 
 
 def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_status(
@@ -407,8 +370,7 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
 
 
 def test_a_goal_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, DAY)
     aborted = {"topic": TOPIC, "condition_type": "equals", "value": "aborted"}
     status = "status_list.1.status"
     goal = asked(memory, "find_matches", **aborted, fields=[status])["sightings"][0]["value"]
@@ -417,14 +379,11 @@ def test_a_goal_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path
     assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
 
 
-ENDS = st.sampled_from([4, 5, 6])
-
-History = list[tuple[int, Mapping[int, int]]]
-
-
 @settings(max_examples=examples(15))
 @given(
-    st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
+    st.lists(
+        st.tuples(st.integers(1, 9), st.integers(1, 9), st.integers(4, 6)), min_size=1, max_size=4
+    ),
     st.integers(1, 5),
     st.booleans(),
 )
@@ -432,7 +391,7 @@ def test_however_the_history_is_cut_the_same_is_told(
     runs: list[tuple[int, int, int]], cut: int, recalls: bool
 ) -> None:
     at, expected, statuses = 5, [], dict[int, int]()
-    messages: History = [(1, {})]
+    messages: list[tuple[int, Mapping[int, int]]] = [(1, {})]
     words = {4: "succeeded", 5: "canceled", 6: "aborted"}
     for goal, (pause, length, end) in enumerate(runs):
         at += pause
@@ -444,11 +403,11 @@ def test_however_the_history_is_cut_the_same_is_told(
         expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
     with TemporaryDirectory() as folder:
         found = told_goals(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
-        searched = found_in(memory_of(Path(folder), recalls=recalls), "above", 3, "status")
+        searched = found_in(memory_of(Path(folder), recalls=recalls), "above", 3, field="status")
     assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
     assert [
         (f"/drive goal {status} after {end - begin:g} s", begin, end)
-        for _, status, begin, end, _ in reversed(searched)
+        for _, status, begin, end in reversed(searched)
     ] == expected
 
 

@@ -1,9 +1,11 @@
-"""Search in a place, in any of several places, and while other topics meet conditions.
+"""Search and ways in a place, in any of several places, and while other topics meet conditions.
 
 What is expected is counted from the drawn world itself, second by second.
 """
 
 import math
+from functools import partial
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,41 +14,27 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.history.context import Memory
-from tests.support.bags import (
-    boolean,
-    octets,
-    odom,
-    text,
-    write_mcap,
-)
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import TimeRange
+from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
+from ros2_memory.queries import trajectory_summary
+from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S
-from tests.support.rooms import BEGIN, ROOMS, World, asked_of, bounds, draw, write
+from tests.support.rooms import BEGIN, ROOMS, asked_of, bounds, draw, write
 from tests.support.tables import table
 
-SECONDS = 400
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
-SPAN = {"start": BEGIN, "end": BEGIN + SECONDS}
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
-    return draw(3, SECONDS)
-
-
-@pytest.fixture(scope="module")
-def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     bags = tmp_path_factory.mktemp("rooms")
-    write(world, bags)
-    return bags
-
-
-@pytest.fixture(scope="module")
-def memory(folder: Path) -> Memory:
-    return asked_of(folder, stored=True)
+    write(draw(3, 60), bags)
+    return asked_of(bags, stored=True)
 
 
 @settings(max_examples=examples(8))
@@ -75,39 +63,27 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
         assert [row["arrived"] - BEGIN for row in reversed(visits["visits"])] == [
             run.first for run in runs
         ]
-        driven = asked(memory, "trajectory_summary", where=where, start=BEGIN, end=BEGIN + 150)
+        span = {"start": BEGIN, "end": BEGIN + 150}
+        driven = asked(memory, "trajectory_summary", where=where, **span)
         assert driven["visits"] == len(runs)
         assert driven["distance_m"] == pytest.approx(world.metres_in(*rooms), abs=0.3)
-        by_place = table(asked(memory, "visits", where=where, by="place"))
-        assert [*by_place] == [*rooms, "(elsewhere)", "(unknown)", "all"]
+        by_place = {"by": "place", "where": bounds(*rooms), **span}
+        visited = table(asked(memory, "visits", by="place", where=rooms))
+        driven = table(asked(memory, "trajectory_summary", **by_place))
+        said = table(asked(memory, "find_matches", **HELLO, **by_place))
+        named = [*rooms, "(elsewhere)", "(unknown)", "all"]
+        assert [*visited] == [*driven] == [*said] == named
         for room in rooms:
             own = world.runs_in(room)
-            assert by_place[room]["entries"] == sum(run.first > 0 for run in own)
+            assert visited[room]["entries"] == sum(run.first > 0 for run in own)
             # A wall is crossed half a second before the first message in the room, and after.
             ends = sum((run.first > 0) + (run.last < 149) for run in own)
             seconds = sum(run.last - run.first for run in own) + ends / 2
-            assert by_place[room]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
-
-
-@pytest.mark.parametrize("tool", ["find_matches", "trajectory_summary", "visits"])
-def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
-    memory: Memory, world: World, tool: str
-) -> None:
-    given: dict[str, Any] = {**(HELLO if tool == "find_matches" else {}), **SPAN}
-    rows = table(asked(memory, tool, by="place", where=bounds("hall", "kitchen"), **given))
-    assert [*rows] == ["hall", "kitchen", "(elsewhere)", "(unknown)", "all"]
-    named = table(asked(memory, tool, by="place", where=["hall", "kitchen"], **given))
-    assert rows == named
-    if tool == "trajectory_summary":
-        for room in ("hall", "kitchen"):
-            assert rows[room]["metres"] == pytest.approx(world.metres_in(room), abs=0.3)
-        inside = rows["hall"]["metres"] + rows["kitchen"]["metres"]
-        assert inside + rows["(elsewhere)"]["metres"] == pytest.approx(rows["all"]["metres"])
-    elif tool == "find_matches":
-        for room in ("hall", "kitchen"):
-            expected = sum(run.messages for run in world.runs_in(room))
-            assert rows[room]["seconds"] == pytest.approx(expected, abs=len(world.runs_in(room)))
-        assert rows["(elsewhere)"]["seconds"] > 0
+            assert visited[room]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
+            assert driven[room]["metres"] == pytest.approx(world.metres_in(room), abs=0.3)
+            assert said[room]["seconds"] == pytest.approx(seconds, abs=len(own) + 1)
+        metres = sum(driven[each]["metres"] for each in named[:-1])
+        assert driven["all"]["metres"] == pytest.approx(metres, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -180,3 +156,116 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
     for by in ({}, {"by": "hour"}):
         refused = asked(memory, "find_matches", **cup, **by)
         assert said in refused["detail"]
+
+
+@each_way
+def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of_a_place(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Drives 0.5 m/s along x, and turns 0.3 rad/s meanwhile, as a holonomic robot may."""
+    messages = [odom(MAP_BEGIN + n * S // 10, n / 20, 0.0, 0.03 * n) for n in range(900)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"start": MAP_BEGIN / S, "end": MAP_BEGIN / S + 90}
+    where = {"x": [15, 20], "y": [-1, 1]}
+    inside = asked(memory, "trajectory_summary", where=where, **window)
+    assert len(inside["waypoints"]) == 2
+    for each in inside["waypoints"]:
+        there = asked(memory, "get_position_at", timestamp=each["timestamp"])
+        assert each["yaw_deg"] == there["yaw_deg"]
+
+
+@settings(max_examples=examples(8))
+@given(
+    seed=st.integers(0, 10_000),
+    stored=st.booleans(),
+    x=st.floats(-3, 15),
+    first=st.integers(0, 120),
+    rooms=st.lists(st.sampled_from([*ROOMS]), max_size=2, unique=True),
+)
+def test_it_is_the_pose_of_the_window_or_of_a_place_that_is_farthest(
+    seed: int, stored: bool, x: float, first: int, rooms: list[str]
+) -> None:
+    world = draw(seed, 200)
+    with TemporaryDirectory() as name:
+        write(world, Path(name))
+        memory = asked_of(Path(name), stored=stored)
+        bounds = {"start": BEGIN + first, "end": BEGIN + first + 60}
+        given: dict[str, Any] = {"where": ", ".join(rooms)} if rooms else {}
+        point = {"x": x, "y": 1.0}
+        reply = asked(memory, "trajectory_summary", farthest_from=point, **bounds, **given)
+        poses = {
+            nth: math.hypot(world.x[nth] - x, 1.0)
+            for nth in range(first, first + 61)
+            if not rooms or world.room(nth) in rooms
+        }
+        if not poses:
+            assert "farthest" not in reply
+            return
+        farthest = reply["farthest"]
+        assert farthest["distance_m"] == pytest.approx(max(poses.values()), abs=0.001)
+        at = round(farthest["timestamp"] - BEGIN)
+        assert poses[at] == pytest.approx(max(poses.values()), abs=1e-6)
+        assert (farthest["x"], farthest["frame_id"]) == (world.x[at], "odom")
+        assert farthest["from"] == {"x": pytest.approx(x, abs=1e-3), "y": 1.0}
+        assert farthest.get("in") == world.room(at)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"farthest_from": "attic"}, "farthest_from: no place is named"),
+        ({"farthest_from": "kitchen, hall"}, "farthest_from has several places; give one"),
+        ({"farthest_from": {"x": 1}}, "farthest_from was"),
+        ({"farthest_from": "hall", "topic": "/other"}, "/other"),
+        ({"farthest_from": "hall", "by": "hour"}, "farthest_from cannot be combined with by"),
+        ({"farthest_from": {"x": 1, "y": 2}, "frame_id": "moon"}, 'frame_id was "moon"'),
+    ],
+)
+def test_what_is_no_point_is_named(memory: Memory, given: dict[str, Any], said: str) -> None:
+    span = {"start": BEGIN, "end": BEGIN + 60}
+    reply = asked(memory, "trajectory_summary", **span, **given)
+    assert said in reply["detail"]
+
+
+@each_way
+def test_a_path_by_transforms_is_whole_where_a_bag_reaches_from_1970_to_now(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The clock was set while it was recorded: of half a million hours two have messages."""
+    times = [20 * S, *(MAP_BEGIN + n * S // 10 for n in range(300))]
+    poses = [tf(at, transform(at, "odom", "base_link", (1.0, 0, 0))) for at in times]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    memory = memory_of(tmp_path, recalls=recalls)
+    # Each look at the clock takes 10 ms.
+    call = Call(Deadline.after(20.0, partial(next, count(0.0, 0.01))))
+    found = trajectory_summary(memory, call, TimeRange(0.0, MAP_BEGIN / S + 30))
+    assert found.trajectory.poses == 301
+    assert "out of time" not in str(found.notes)
+
+
+stands = st.lists(
+    st.builds(
+        PlacedStandstill,
+        st.floats(0, 3),
+        st.floats(0, 3),
+        st.integers(0, 10**9),
+        st.integers(1, 10**9),
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=examples(40))
+@given(stands, stands)
+def test_every_standstill_is_of_one_place_and_near_to_it(
+    one: list[PlacedStandstill], two: list[PlacedStandstill]
+) -> None:
+    found = stood_at(one, two)
+    for side, given_ones in enumerate((one, two)):
+        seconds = sum(at.seconds[side] or 0.0 for at in found)
+        assert seconds == pytest.approx(sum(each.duration for each in given_ones) / S)
+        for each in given_ones:
+            assert min(math.dist(at.place, (each.x, each.y)) for at in found) <= 0.5
+    assert {at.place for at in found} <= {(each.x, each.y) for each in (*one, *two)}
+    assert [at.seconds for at in stood_at(two, one)] == [at.seconds[::-1] for at in found]
