@@ -9,7 +9,6 @@ import random
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -37,7 +36,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, remembered, with_store
 from tests.support.noting_reader import NotingReader
 
 T0_S = 1_700_000_000
@@ -70,8 +69,7 @@ def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
 
 
 def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5), text(T0, "POWER_SUPPLY_STATUS_FULL")])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [battery(T0, 0.5), text(T0, "POWER_SUPPLY_STATUS_FULL")])
 
     def newest(
         word: str, topic: str = "/battery_state", field: str = "power_supply_status"
@@ -87,12 +85,12 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
 
 def test_a_constant_that_is_no_whole_number_is_not_taken_for_one(tmp_path: Path) -> None:
     body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
-    write_mcap(tmp_path / "bag.mcap", [Msg("/winch", "winch_msgs/msg/Winch", T0, body)])
+    memory = remembered(tmp_path, [Msg("/winch", "winch_msgs/msg/Winch", T0, body)])
     with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
-        last(memory_of(tmp_path), "equals", "CABLE_LONGEST", "/winch", field="cable")
+        last(memory, "equals", "CABLE_LONGEST", "/winch", field="cable")
 
 
-@pytest.mark.parametrize("recalls", [False, True])
+@each_way
 def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recalls: bool) -> None:
     level = make("std_msgs/msg/Float32", data=45.5)
     before = [Msg("/level", "std_msgs/msg/Float32", T0, level), text(T0, "45", topic="/said")]
@@ -118,16 +116,15 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
 
 
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
-    question = (memory_of(tmp_path), Call(), "/battery_state")
+    memory = remembered(tmp_path, [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
+    question = (memory, Call(), "/battery_state")
     searches: tuple[Callable[..., object], ...] = (queries.find_last_match, find_matches)
     for kind, search in itertools.product(("below", "above"), searches):
         with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
             search(*question, kind, 20, field="percentage")
     assert at(queries.find_last_match(*question, "above", 0.2, field="percentage")) == 0
     for unknown in (math.nan, -1.0):  # it states no charge, be it in percent or as a fraction
-        write_mcap(tmp_path / "bag.mcap", [battery(T0, unknown)])
-        question = (memory_of(tmp_path), Call(), "/battery_state")
+        question = (remembered(tmp_path, [battery(T0, unknown)]), Call(), "/battery_state")
         assert queries.find_last_match(*question, "above", 20, field="percentage").found is None
 
 
@@ -138,30 +135,27 @@ def test_never_of_a_word_names_the_constant_that_has_it(
 ) -> None:
     body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
     messages = [Msg("/winch", "winch_msgs/msg/Winch", T0, body), text(T0, "up", "/winch_log")]
-    write_mcap(tmp_path / "bag.mcap", messages)
+    memory = remembered(tmp_path, messages)
     note = (
         f'"{word.lower()}" names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
         "ask equals on the field of that number"
     )
     for topic in ("/winch", "/winch*"):
-        question = (memory_of(tmp_path), Call(), topic, kind)
+        question = (memory, Call(), topic, kind)
         assert queries.find_last_match(*question, word).notes == (note,)
         assert find_matches(*question, word).notes == (note,)
         assert queries.find_last_match(*question, "paying").notes == ()
     if word == "hauling":
         with pytest.raises(InvalidArgumentsError, match=r"such as STATE_HAULING = 2$"):
-            queries.find_last_match(
-                memory_of(tmp_path), Call(), "/winch", kind, word, field="state"
-            )
+            last(memory, kind, word, "/winch", field="state")
 
 
 def test_a_constant_is_refused_without_the_field_of_its_number(tmp_path: Path) -> None:
     """Its number may also be a byte of an id."""
-    write_mcap(tmp_path / "bag.mcap", [goals(T0, {6: 4})])
-    question = (memory_of(tmp_path), Call(), "/drive/_action/status", "equals", "STATUS_ABORTED")
+    memory = remembered(tmp_path, [goals(T0, {6: 4})])
     advice = r"such as STATUS_ABORTED = 6: ask equals on the field of that number$"
     with pytest.raises(InvalidArgumentsError, match=advice):
-        queries.find_last_match(*question)
+        last(memory, "equals", "STATUS_ABORTED", "/drive/_action/status")
 
 
 @pytest.mark.parametrize("value", [5, True])
@@ -185,12 +179,9 @@ def last(
     condition_type: str,
     value: JsonValue,
     topic: str = SCENE,
-    call: Call | None = None,
     field: str | None = None,
 ) -> Match:
-    return queries.find_last_match(
-        memory, call or Call(), topic, condition_type, value, field=field
-    )
+    return queries.find_last_match(memory, Call(), topic, condition_type, value, field=field)
 
 
 def at(match: Match) -> int:
@@ -202,8 +193,7 @@ def test_a_bag_beyond_its_share_is_searched_by_its_columns(tmp_path: Path) -> No
     draw = random.Random(7)
     xs = [draw.choice([-1, 1]) * draw.uniform(1, 9) for _ in range(1000)]
     drive = [odom(T0 + n * NS_PER_S // 100, x, draw.uniform(-9, 9)) for n, x in enumerate(xs)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", drive)
-    plain = memory_of(tmp_path)
+    plain = remembered(tmp_path, drive)
     memory = with_store(plain, tmp_path, share=0.0)
     whole = McapReader.decode
     with patch.object(McapReader, "decode", autospec=True, side_effect=whole) as decode:
@@ -239,8 +229,8 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
         said = [(2, "wash"), (9, "")] if nth % 2 else [(2, "dry"), (9, "wash")]
         messages = [text(T0 + (nth * 3600 + at) * NS_PER_S, word) for at, word in said]
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
-    over = partial(next, chain([0.0], repeat(math.inf)))
-    monkeypatch.setattr(Call, "partial_after", lambda *_: Deadline.after(1.0, over))
+    over = Deadline.after(0, itertools.count().__next__)
+    monkeypatch.setattr(Call, "partial_after", lambda *_: over)
     wash = {"topic": "/chatter", "condition_type": "contains", "value": "wash"}
     reply = asked(memory_of(tmp_path), "find_matches", **wash)
     assert len(reply["sightings"]) == 4

@@ -2,12 +2,9 @@
 
 import os
 import random
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
-from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
@@ -16,11 +13,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns import decode
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
@@ -30,18 +25,16 @@ from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
-    detections,
     log_entry,
     make,
     odom,
-    text,
     write_mcap,
 )
 from tests.support.column_worlds import EVERYTHING
-from tests.support.examples import LONG, examples
-from tests.support.memories import asked, assert_same_counts, memory_of, with_store
+from tests.support.examples import examples
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.noting_reader import fail_reading
-from tests.support.random_histories import MS, S
+from tests.support.random_histories import S
 
 T0: Final = 1_700_006_400 * S
 
@@ -195,48 +188,7 @@ def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
     assert "a/a_0.mcap was deleted before it could be read" in deleted.notes.sentences()[0]
 
 
-SPAN: Final = {"start": T0 / S - 5, "end": T0 / S + 200}
-
-CUP: Final = {"topic": "/chatter", "condition_type": "contains", "value": "cup"}
-
-
-def said_in(recordings: Mapping[str, list[Msg]], topic: str) -> Iterator[tuple[int, str]]:
-    """Log time (ns) and text of each message: by log time, then by recording; copies count once."""
-    every = [
-        (each.log_time, name, nth, each)
-        for name, messages in recordings.items()
-        for nth, each in enumerate(messages)
-        if each.topic == topic
-    ]
-    known: defaultdict[tuple[int, str], Counter[str]] = defaultdict(Counter)
-    for at, name, _, message in sorted(every, key=lambda row: row[:3]):
-        body: Any = message.body
-        copies = known[message.published, body.data]
-        most = max(copies.values(), default=0)
-        copies[name] += 1
-        if copies[name] > most:
-            yield at, body.data
-
-
-def sightings(recordings: Mapping[str, list[Msg]]) -> tuple[int, float]:
-    """How many runs of cups there are, and how long they last until another text, in seconds."""
-    found = [*said_in(recordings, "/chatter")]
-    count, total, goes_on = 0, 0, False
-    for (at, word), (following, _) in pairwise([*found, (MAX_NS, "")]):
-        count += word == "cup" and not goes_on
-        goes_on = word == "cup" and following - at <= SILENCE_NS
-        total += (following - at) * goes_on
-    return count, total / S
-
-
-def counted(memory: Memory) -> tuple[int, float]:
-    """The same as `find_matches` counts it; both are 0 where there is no such topic."""
-    reply = asked(memory, "find_matches", **CUP, by="day", **SPAN)
-    values = dict(zip(reply.get("columns", ())[1:], reply.get("all", ()), strict=True))
-    return values.get("count", 0), values.get("seconds", 0.0)
-
-
-@pytest.mark.parametrize("recalls", [False, True], ids=["bags", "store"])
+@each_way
 def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
 ) -> None:
@@ -257,110 +209,3 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     for nth in range(0, 50, 6):
         found = asked(memory, "find_matches", **wanted, value=4_000 * nth + 700)
         assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]
-
-
-def _message(draw: Random, kind: int, at: int) -> Msg:
-    if kind == 0:
-        return text(at, draw.choice(["cup", "cup", "cat", "dog"]), "/chatter")
-    if kind == 1:
-        return boolean(at, draw.random() < 0.6)
-    if kind == 2:
-        labels = draw.choice([["cup"], ["cup", "dog"], [], ["dog"]])
-        return detections(at, labels, topic="/vision", score=draw.choice([0.1, 0.5]))
-    if kind == 3:
-        label, score = draw.choice(["cup", "dog"]), draw.choice([0.1, 0.5])
-        return text(at, f'[{{"label": "{label}", "score": {score}}}]', "/json")
-    return odom(at, draw.choice([-1.0, 1.0, 1.0]))
-
-
-def _published(draw: Random, start: int, stop: int) -> list[Msg]:
-    """Text, booleans, detections and poses at whole tenths of seconds, now and then none."""
-    found: list[Msg] = []
-    for kind in range(5):
-        at = T0 + start * S
-        while (at := at + draw.choice([1, 2, 5, 5, 10, 30, 110]) * 100 * MS) < T0 + stop * S:
-            found.append(replace(_message(draw, kind, at), publish_time=at))
-    return found or [odom(T0 + start * S)]
-
-
-def draw_recordings(draw: Random) -> dict[str, list[Msg]]:
-    """Two or three recordings that overlap, of which messages often have one log time."""
-    seconds = draw.choice([5, 20, 40])
-    begin = draw.randrange(seconds)
-    names = draw.sample(["a", "ab", "b", "c"], draw.randint(2, 3))
-    first, second, *others = names
-    found = {first: _published(draw, 0, seconds)}
-    found[second] = _published(draw, begin, begin + draw.choice([3, 20, 40]))
-    if draw.random() < 0.5:
-        late = [each for each in found[first] if each.log_time >= T0 + begin * S]
-        found[second] += [
-            replace(each, log_time=each.log_time + draw.choice([0, 1, 500]) * MS) for each in late
-        ]
-    for name in others:
-        found[name] = _published(draw, 2, 12)
-    return {name: sorted(some, key=lambda each: each.log_time) for name, some in found.items()}
-
-
-def _on_chatter(message: Msg) -> Msg:
-    return replace(message, topic="/chatter") if message.topic == "/bumper" else message
-
-
-def write_cut(bag_dir: Path, recordings: Mapping[str, list[Msg]], draw: Random) -> None:
-    """Writes recordings, each cut into splits anywhere."""
-    for name, messages in recordings.items():
-        inside = {draw.randrange(len(messages)) for _ in range(draw.choice([0, 1, 3, 6]))} - {0}
-        for nth, (begin, end) in enumerate(pairwise([0, *sorted(inside), len(messages)])):
-            write_mcap(bag_dir / name / f"{name}_{nth}.mcap", messages[begin:end])
-
-
-TRUE: Final = {"topic": "/bumper", "condition_type": "equals", "value": True}
-
-
-QUESTIONS: Final[Sequence[tuple[str, dict[str, Any]]]] = [
-    ("find_matches", {**CUP, "by": "day"}),
-    ("find_matches", {**CUP, "by": "hour"}),
-    ("find_matches", CUP),
-    ("find_matches", {**CUP, "where": {"x": 1, "y": 0, "radius_m": 0.5}, "by": "day"}),
-    ("find_matches", {**CUP, "while": TRUE}),
-    ("find_matches", {**CUP, "value": "c", "by": "value"}),
-    ("find_matches", {**TRUE, "by": "day"}),
-    ("find_matches", {**CUP, "topic": "/vision", "by": "hour"}),
-    ("find_matches", {**CUP, "topic": "/vision", "min_score": 0.3, "by": "day"}),
-    ("find_matches", {**CUP, "topic": "/vision", "by": "label"}),
-    ("find_matches", {**CUP, "topic": "/json", "min_score": 0.3, "by": "day"}),
-    ("get_topic_in_range", {"topic": "/chatter", "changes": True}),
-    ("get_topic_in_range", {"topic": "/chatter", "max_samples": 9}),
-    ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "by": "hour"}),
-    ("trajectory_summary", {}),
-    ("visits", {"x": 1.0, "y": 0.0, "radius_m": 0.5}),
-    ("recap", {}),
-]
-
-
-@settings(max_examples=10 if LONG else 1)
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 0.5]), has_types=st.booleans())
-@example(seed=12, part=1.0, has_types=False)
-@example(seed=35, part=0.5, has_types=False)
-@example(seed=6, part=0.5, has_types=True)
-@example(seed=321, part=1.0, has_types=True)
-def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
-    seed: int, part: float, has_types: bool
-) -> None:
-    """Also of a topic of two types."""
-    draw = random.Random(seed)
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        recordings = draw_recordings(draw)
-        if has_types:
-            recordings = {name: [*map(_on_chatter, some)] for name, some in recordings.items()}
-        write_cut(bag_dir, recordings, draw)
-        plain = memory_of(bag_dir)
-        every = [with_store(plain, bag_dir, part=part, share=share) for share in (1.0, 0.0)]
-        recorded = asked(plain, "data_time_range")
-        # Durations are without gaps, and pauses that look as where the clock was set ahead.
-        if not has_types and not recorded["clock_steps"] and not recorded["gaps"]:
-            assert counted(plain) == pytest.approx(sightings(recordings), abs=0.051)
-        for name, given_ in QUESTIONS:
-            expected = asked(plain, name, **given_, **SPAN)
-            stored = draw.choice(every)
-            assert_same_counts(asked(stored, name, **given_, **SPAN), expected)

@@ -65,12 +65,19 @@ def each_known(memory: Memory) -> Iterator[Memory]:
 
 
 @pytest.mark.parametrize(
-    ("when", "by"), [(54.95, 8.0), (59.95, 2.95)], ids=["in a split", "between two"]
+    ("stands", "when", "by"),
+    [(False, 54.95, 8.0), (False, 59.95, 2.95), (True, 54.95, 2.0), (True, 59.95, 0.8)],
+    ids=["in a split", "between two", "in a split, it stands", "between two, it stands"],
 )
 def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
-    tmp_path: Path, when: float, by: float
+    tmp_path: Path, stands: bool, when: float, by: float
 ) -> None:
-    for memory in each_known(recorded(tmp_path, shown=lambda t: t + by * (t > when))):
+    """Where the robot stands, stamps of another clock show it."""
+    if stands:
+        plain = stamped(tmp_path, delay=lambda t: by * (t > when))
+    else:
+        plain = recorded(tmp_path, shown=lambda t: t + by * (t > when))
+    for memory in each_known(plain):
         at = BEGIN + round(when - 0.05, 1)
         expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(by, abs=0.01)}]
         assert asked(memory, "data_time_range")["clock_steps"] == expected
@@ -163,19 +170,6 @@ def stamped(
             yield battery(at + 1000, 0.5, log_time=logged + 1)
 
     return written(folder, at_beat)
-
-
-@pytest.mark.parametrize(("when", "by"), [(54.95, 2.0), (59.95, 0.8)])
-def test_a_clock_set_while_the_robot_stands_shows_in_stamps_of_another_clock(
-    tmp_path: Path, when: float, by: float
-) -> None:
-    for memory in each_known(stamped(tmp_path, delay=lambda t: by * (t > when))):
-        [step] = steps(memory)
-        at = BEGIN + round(when - 0.05, 1)
-        assert step == {
-            "at": pytest.approx(at, abs=1e-5),
-            "step_s": pytest.approx(by, abs=0.01),
-        }
 
 
 def test_pauses_that_are_not_looked_at_are_noted(
@@ -273,23 +267,18 @@ def stalled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return with_store(memory, tmp_path) if request.param == "stored" else memory
 
 
-def ask(memory: Memory, tool: str, **arguments: Any) -> dict[str, Any]:
-    found: dict[str, Any] = asked(memory, tool, **arguments)
-    return found
-
-
 def gaps(memory: Memory) -> list[tuple[float, float]]:
-    found = ask(memory, "data_time_range")["gaps"]
+    found = asked(memory, "data_time_range")["gaps"]
     return [(round(gap["start"] - BEGIN, 3), round(gap["end"] - BEGIN, 3)) for gap in found]
 
 
 def test_gaps_within_bags_are_listed_wherever_gaps_are(stalled: Memory) -> None:
     assert gaps(stalled) == [(7.995, 11.0), (15.995, 16.7)]
-    status = ask(stalled, "memory_status")
+    status = asked(stalled, "memory_status")
     assert [gap["duration_s"] for gap in status["gaps"]] == pytest.approx([0.705, 3.005], abs=0.001)
     assert status["doubts"] == "while the recorder ran, nothing was recorded 2 times (3.71 s)"
     window = {"start": BEGIN + 8.5, "end": BEGIN + 10.5}
-    reply = ask(stalled, "get_topic_in_range", topic="/chatter", **window)
+    reply = asked(stalled, "get_topic_in_range", topic="/chatter", **window)
     assert (reply["error"], reply["reason"]) == ("no_data", "gap")
 
 
@@ -302,5 +291,5 @@ def test_a_recorder_did_not_stall_where_another_recording_lies_within_its_pause(
     write_mcap(tmp_path / "older" / "older_0.mcap", between)
     memory = memory_with(tmp_path, [*bag, *ahead])
     assert len(gaps(memory)) == 3 * len(STALLS) + 2
-    doubts = ask(memory, "memory_status")["doubts"]
+    doubts = asked(memory, "memory_status")["doubts"]
     assert doubts.endswith("while the recorder ran, nothing was recorded 6 times (11.13 s)")

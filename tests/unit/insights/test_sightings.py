@@ -39,7 +39,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -49,8 +49,8 @@ OBJECTS = "/vision/scene/scene_objects"
 
 
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
-    write_splits(tmp_path, [detections(BEGIN, ["cup"], score=0.2)])
-    memory = memory_of(tmp_path, limits=QuerySettings(min_score=0.5))
+    seen, limits = [detections(BEGIN, ["cup"], score=0.2)], QuerySettings(min_score=0.5)
+    memory = remembered(tmp_path, seen, limits=limits)
     note = "detections with a score below 0.5 do not count here, unless min_score is given"
     asked = (memory, Call(), OBJECTS, "contains", "cup")
     assert find_matches(*asked).notes == (note,)
@@ -59,16 +59,15 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 
 
 def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
-    write_splits(tmp_path, [detections(BEGIN, ["scissors"])])
+    memory = remembered(tmp_path, [detections(BEGIN, ["scissors"])])
     note = f'"the scissors" was not found, but "scissors" was, last at {BEGIN / S:.6f}'
-    found = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "the scissors")
+    found = find_matches(memory, Call(), OBJECTS, "contains", "the scissors")
     assert found.notes == (note,)
 
 
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
-    write_splits(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
     place: JsonValue = {"x": 1.0, "y": 2.0, "frame_id": "odom"}
     asked = (memory, Call(), "/odom", "near_position")
     assert len(find_matches(*asked, place).sightings) == 1
@@ -208,8 +207,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     lines = [(20, "begins"), (30, "slow"), (40, "lost"), (30, "slow"), (20, "ends")]
     logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
     state = diagnostics(BEGIN + 5 * S, motor=(1, "hot"))
-    write_splits(tmp_path, [*logged, state])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [*logged, state])
 
     def texts(kind: str, value: JsonValue) -> list[object]:
         call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}
@@ -275,8 +273,7 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
 def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
     tmp_path: Path, name: str, more: dict[str, str]
 ) -> None:
-    write_splits(tmp_path, [odom(BEGIN), boolean(BEGIN, True)])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [odom(BEGIN), boolean(BEGIN, True)])
     asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
     topic = "condition_topic" if "value_topic" in more else "topic"
     missing = asked(memory, name, **asks, **{topic: "/rosout"})
@@ -290,8 +287,7 @@ def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
 def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -> None:
     seen = [json.dumps({"label": label}) for label in ("кружка", "cup", 'the "big" one')]
     said = [text(BEGIN + n * S, word, topic="/seen") for n, word in enumerate(seen)]
-    write_splits(tmp_path, said)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, said, recalls=recalls)
     for value, at in (("Кружка", 0), ('"big"', 2)):
         for condition_type in ("contains", "contains_word"):
             found = find_matches(memory, Call(), "/seen", condition_type, value).sightings
@@ -323,23 +319,19 @@ def memory(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
     return written(tmp_path_factory.mktemp("bags"), stored=request.param)
 
 
-def ask(memory: Memory, tool: str, **given: object) -> Any:
-    return asked(memory, tool, **given)
-
-
 def test_changes_are_one_row_for_each_value_with_what_held_at_the_start(memory: Memory) -> None:
     window = {"start": T0 + 50, "end": T0 + 130}
-    reply = ask(memory, "get_topic_in_range", topic="/task", changes=True, **window)
+    reply = asked(memory, "get_topic_in_range", topic="/task", changes=True, **window)
     assert [(row["start"] - T0, row["value"]) for row in reply["changes"]] == [
         (10, "wash the pot"),
         (80, "wash the potato"),
         (120, "use a knife"),
     ]
     assert "notes" not in reply
-    few = ask(memory, "get_topic_in_range", topic="/task", changes=True, max_samples=2, **window)
+    few = asked(memory, "get_topic_in_range", topic="/task", changes=True, max_samples=2, **window)
     assert (few["total"], len(few["changes"])) == (3, 2)
     assert few["notes"][0].startswith("the first 2 of 3 changes: to continue")
-    docked = ask(memory, "get_topic_in_range", topic="/docked", changes=True, **window)
+    docked = asked(memory, "get_topic_in_range", topic="/docked", changes=True, **window)
     assert [row["value"] for row in docked["changes"]] == [False, True]
 
 
@@ -355,12 +347,11 @@ def test_a_number_is_written_as_everywhere_else(
     type_name = f"std_msgs/msg/{kind}"
     said = [make(type_name, data=value) for value in (number, 2.5, number)]
     messages = [Msg("/number", type_name, (T0 + n) * S, body) for n, body in enumerate(said)]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, messages, recalls=recalls)
     given = {"topic": "/number", "start": T0, "end": T0 + 9}
-    samples = ask(memory, "get_topic_in_range", **given)["samples"]
-    changes = ask(memory, "get_topic_in_range", **given, changes=True)["changes"]
-    rows = ask(memory, "get_topic_in_range", **given, by="value")["rows"]
+    samples = asked(memory, "get_topic_in_range", **given)["samples"]
+    changes = asked(memory, "get_topic_in_range", **given, changes=True)["changes"]
+    rows = asked(memory, "get_topic_in_range", **given, by="value")["rows"]
     shown = [str(row["value"]) for row in changes]
     assert shown == [str(number), "2.5", str(number)]
     assert shown == [str(each["value"]["value"]) for each in samples]
@@ -370,13 +361,12 @@ def test_a_number_is_written_as_everywhere_else(
 @each_way
 def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: bool) -> None:
     said = [octets((T0 + n) * S, [n] * 60) for n in range(10)]
-    write_splits(tmp_path, said)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, said, recalls=recalls)
     given = {"topic": "/octets", "start": T0, "end": T0 + 9}
     for how in ({"changes": True}, {"by": "value"}):
-        reply = ask(memory, "get_topic_in_range", **given, **how, fields=["data"])
+        reply = asked(memory, "get_topic_in_range", **given, **how, fields=["data"])
         assert "field data of /octets" in reply["detail"]
-        reply = ask(memory, "get_topic_in_range", **given, **how, fields=["data.7"])
+        reply = asked(memory, "get_topic_in_range", **given, **how, fields=["data.7"])
         assert len(reply["changes"] if "changes" in how else reply["rows"]) == 10
 
 
@@ -393,10 +383,10 @@ def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(
     monkeypatch.setattr(sightings, "says_episodes", lambda *_: True)
     monkeypatch.setattr(HeldValues, "_check", check)
     given = {"topic": "/task", "condition_type": "equals"}
-    some = ask(written(tmp_path), "find_matches", **given, value="rest")
+    some = asked(written(tmp_path), "find_matches", **given, value="rest")
     assert (some["at_least"], some["more"]) == (1, True)
     assert f"ran out of time at {T0 + 260}" in some["notes"][0]
-    none = ask(written(tmp_path / "again"), "find_matches", **given, value="wash the potato")
+    none = asked(written(tmp_path / "again"), "find_matches", **given, value="wash the potato")
     assert (none["error"], none["searched_back_to"]) == ("timeout", T0 + 260)
 
 
@@ -405,7 +395,7 @@ def test_values_that_are_too_long_to_be_held_are_named(
 ) -> None:
     monkeypatch.setattr(held_values, "_MOST_CHARS", 40)
     window = {"start": T0, "end": T0 + 319}
-    reply = ask(memory, "get_topic_in_range", topic="/task", by="value", **window)
+    reply = asked(memory, "get_topic_in_range", topic="/task", by="value", **window)
     assert [row[0] for row in reply["rows"]] == ["use a butter knife", "wash the pot"]
     [note] = [each for each in reply["notes"] if "more than 40 characters" in each]
     assert f"only what is after {T0 + 200}.000000 is counted" in note
@@ -416,7 +406,7 @@ def test_of_more_episodes_than_are_counted_the_newest_are(
 ) -> None:
     monkeypatch.setattr(sightings, "MOST_COUNTED", 2)
     given = {"topic": "/task", "condition_type": "contains", "value": "wash", "by": "day"}
-    reply = ask(memory, "find_matches", **given)
+    reply = asked(memory, "find_matches", **given)
     assert (reply["start"], table(reply)["all"]["count"]) == (T0 + 80, 2)
     [note] = [each for each in reply["notes"] if "is counted" in each]
     assert note.endswith("is counted: more than 2 episodes; ask about a shorter window")

@@ -4,8 +4,7 @@ import math
 import random
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import chain, pairwise, repeat
+from itertools import count, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -354,8 +353,7 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
     memory = memory_of(tmp_path, limits=QuerySettings(tf_topics=("/tf", "/own/tf")))
     known_since: set[int | None] = set()
     for looks in range(0, 60, 2):
-        clock = chain([0.0] * (looks + 1), repeat(math.inf))
-        deadline = Deadline.after(1.0, partial(next, clock))
+        deadline = Deadline.after(looks, count().__next__)
         monkeypatch.setattr(Call, "partial_after", lambda *_, deadline=deadline: deadline)
         known = TrackReader(View(memory, Call()), "odom").track_in(
             TimeWindow(BEGIN, BEGIN + 120 * S)

@@ -107,19 +107,11 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     assert "things" not in str(until_its_end["notes"])
 
 
-DAY: Final = 86_400
-DAYS: Final = 6
 LABELS: Final = ("mug", "book", "lamp", "bag", "vase", "radio", "plant", "clock")
-LAST_DAY: Final = BEGIN + (DAYS - 1) * DAY
 
 
 def ask(bag_dir: Path, tool: str, **given: object) -> Any:
     return asked(memory_of(bag_dir, limits=NAMED), tool, **given)
-
-
-def compare(bag_dir: Path) -> Any:
-    earlier = {"with_start": BEGIN, "with_end": LAST_DAY - 1}
-    return ask(bag_dir, "compare", start=LAST_DAY, end=LAST_DAY + DAY, **earlier)
 
 
 # -- sightings, in many worlds -------------------------------------------------------------------
@@ -144,7 +136,7 @@ def sightings(
             xy.append(looks.mean(axis=0))
             dev.append(math.sqrt(((looks - xy[-1]) ** 2).sum(axis=1).mean()))
             side.append(view)
-            first.append((nth * DAY // 2 + bag * 10) * S)
+            first.append((nth * 43_200 + bag * 10) * S)
     begin = np.array(first)
     n = np.full(len(begin), 10)
     return Sightings(np.array(xy), n, np.array(dev), np.array(side), begin, begin + 9 * S)

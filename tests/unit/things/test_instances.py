@@ -2,9 +2,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import pytest
@@ -18,8 +18,7 @@ from ros2_memory.columns.table import Texts
 from ros2_memory.core.arrays import Columns
 from ros2_memory.core.model import Vector3
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.results import UsualPlace
-from ros2_memory.things.estimation import estimate
+from ros2_memory.things.estimation import Estimate, estimate
 from ros2_memory.things.instances import count_misses
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.presence import (
@@ -34,33 +33,26 @@ LABELS = Labels({"mug": ["coffee mug"]})
 HERE = (0.0, 0.0, 0.0)
 
 
-class PlacedDetection(NamedTuple):
-    """A detection in the frame of the sights (m)."""
-
-    label: str
-    place: Vector3 | None
-
-
-Seen: TypeAlias = "tuple[tuple[float, float, float], list[PlacedDetection]]"
+Detections: TypeAlias = "list[tuple[str, Vector3]]"
+"""Labels, and places in the frame of the sights (m)."""
+Seen: TypeAlias = "tuple[Vector3, Detections]"
 """From where (x, y, yaw) a detector published, and what it had."""
 
 
-def bag_of(*messages: Seen, start: int = 0) -> Sights:
-    """The sights of a message each second."""
-    nowhere = (math.nan, math.nan, math.nan)
-    robots = [(x, y, 0.0, yaw, 0.0) for (x, y, yaw), _ in messages]
-    every = [(row, one) for row, (_, things) in enumerate(messages) for one in things]
-    labels = Texts.of([one.label for _, one in every])
+def estimated(*messages: Seen) -> Estimate:
+    """What is made of a message each second."""
+    every = [(row, *one) for row, (_, things) in enumerate(messages) for one in things]
+    labels = Texts.of([label for _, label, _ in every])
     seen = DetectorMessages(
-        np.arange(start, start + len(messages)) * 10**9,
-        np.array(robots, np.float64).reshape(-1, 5),
-        np.array([row for row, _ in every], np.int64),
+        np.arange(len(messages)) * 10**9,
+        np.array([(x, y, 0.0, yaw, 0.0) for (x, y, yaw), _ in messages]),
+        np.array([row for row, *_ in every]),
         labels.codes.astype(np.int64),
         labels.words,
-        np.array([one.place or nowhere for _, one in every], np.float64).reshape(-1, 3),
+        np.array([place for *_, place in every]),
         np.full(len(every), math.nan),
     )
-    return sights_of("/detections", seen)
+    return estimate(whole([sights_of("/detections", seen)]), LABELS)
 
 
 def whole(parts: Sequence[Sights]) -> JoinedSights:
@@ -69,8 +61,8 @@ def whole(parts: Sequence[Sights]) -> JoinedSights:
     return join_sights([pack_sights(part) for part in parts], zeros, zeros)
 
 
-def seen_at(x: float, y: float) -> list[PlacedDetection]:
-    return [PlacedDetection("mug", (x, y, 0.7))]
+def seen_at(x: float, y: float) -> Detections:
+    return [("mug", (x, y, 0.7))]
 
 
 @pytest.mark.parametrize("away_m", [0.62, 0.88, 0.92, 0.96])
@@ -79,7 +71,7 @@ def test_a_thing_that_was_moved_by_less_than_a_metre_after_long_is_where_it_was_
 ) -> None:
     """However little that is of all its detections, it is no noise around its old place."""
     there = [(HERE, seen_at(2, 0))] * 1200
-    [mug] = estimate(whole([bag_of(*there, *[(HERE, seen_at(2, away_m))] * 60)]), LABELS).instances
+    [mug] = estimated(*there, *[(HERE, seen_at(2, away_m))] * 60).instances
     assert mug.stays[-1].y == pytest.approx(away_m * 1000)
     assert (len(mug.stays), mug.missed_by) == (2, None)
 
@@ -88,22 +80,20 @@ def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() 
     """In each slice both are seen, and none goes to and fro between the two places."""
     alone = [(HERE, seen_at(2, 0))] * 2400
     both = [(HERE, [*seen_at(2, 0), *seen_at(2, 0.5)])] * 150
-    found = estimate(whole([bag_of(*alone, *both)]), LABELS)
+    found = estimated(*alone, *both)
     [mugs] = found.instances
     [stay] = mugs.stays
     assert (stay.count, found.side_by_side(stay.spots)) == (2700, 2)
 
 
 def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place() -> None:
-    first, other, back = (2.0, 0.0, 0.7), (-6.0, 8.0, 0.7), (1.0, 9.0, 0.7)
     before, away, beside = (0.0, 9.0, 0.0), (0.0, 0.0, 3.14), (-6.0, 6.0, 1.57)
     called = ["bowl" if nth % 8 == 3 else "mug" for nth in range(120)]
-    seen = [(HERE, [PlacedDetection(label, first)]) for label in called]
-    elsewhere = [(beside, [PlacedDetection("mug", other)])] * 120
-    gone = [(before, [PlacedDetection("mug", back)])] * 120 + [(before, [])] * 120
+    seen = [(HERE, [(label, (2.0, 0.0, 0.7))]) for label in called]
+    elsewhere = [(beside, seen_at(-6.0, 8.0))] * 120
+    gone = [(before, seen_at(1.0, 9.0))] * 120 + [(before, [])] * 120
     nothing: list[Seen] = [(away, [])] * 30
-    bag = bag_of(*gone, *seen, *nothing, *elsewhere, *nothing, *seen)
-    [mug] = estimate(whole([bag]), LABELS).instances
+    [mug] = estimated(*gone, *seen, *nothing, *elsewhere, *nothing, *seen).instances
     assert len(mug.stays) == 4
     assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
 
@@ -226,45 +216,26 @@ def _sights(looks: list[tuple[int, ...]], bags: int) -> JoinedSights:
 
 
 HOUR: Final = 3600 * 10**9
-DAY: Final = 24 * HOUR
 PLACES: Final = np.array([[1000, 1000], [4000, 2000], [7000, 5000], [2000, 8000]])
 DAYS: Final = 30
 
-Drawn: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]"
-Whereabouts: TypeAlias = "Callable[[np.random.Generator, int, int, int], int]"
 
-
-def at_random(chance: np.random.Generator, _day: int, _hour: int, before: int) -> int:
-    return int(chance.integers(len(PLACES))) if chance.random() < 0.15 else before
-
-
-def seldom_moved(chance: np.random.Generator, _day: int, _hour: int, before: int) -> int:
-    return int(chance.integers(len(PLACES))) if chance.random() < 0.01 else before
-
-
-def mostly_at_home(chance: np.random.Generator, _day: int, _hour: int, _before: int) -> int:
-    return 0 if chance.random() < 0.8 else int(chance.integers(len(PLACES)))
-
-
-def month(seed: int, whereabouts: Whereabouts) -> Drawn:
-    """Returns when (ns) and where (mm) a thing was seen, and its place in each hour."""
+def month(seed: int, moves: float, is_at_home: float) -> tuple[NDArray[np.int64], ...]:
+    """Returns when (ns) and where (mm) a thing was seen that moves at any hour, or goes home."""
     chance = np.random.default_rng(seed)
-    times, seen, places = [], [], [0]
+    times, seen, place = [], [], 0
     for hour in range(DAYS * 24):
-        places.append(whereabouts(chance, hour // 24, hour % 24, places[-1]))
+        if chance.random() < moves:
+            place = 0 if chance.random() < is_at_home else int(chance.integers(len(PLACES)))
         if 7 <= hour % 24 < 23 and chance.random() < 0.35:
             times.append(hour * HOUR + int(chance.integers(HOUR)))
-            seen.append(PLACES[places[-1]] + chance.normal(0, 80, 2).astype(np.int64))
-    return np.array(times), np.array(seen), np.array(places[1:])
+            seen.append(PLACES[place] + chance.normal(0, 80, 2).astype(np.int64))
+    return np.array(times), np.array(seen)
 
 
-def told(drawn: Drawn, at: int) -> tuple[UsualPlace, ...] | None:
-    times, seen, _ = drawn
-    return usual_places(times[times < at], seen[times < at], at, lambda _: 0)
-
-
-@pytest.mark.parametrize("whereabouts", [at_random, seldom_moved, mostly_at_home])
-def test_without_a_routine_none_is_told(whereabouts: Whereabouts) -> None:
+@pytest.mark.parametrize(("moves", "is_at_home"), [(0.15, 0.0), (0.01, 0.0), (1.0, 0.8)])
+def test_without_a_routine_none_is_told(moves: float, is_at_home: float) -> None:
     """One of twenty may be found by chance."""
-    found = [told(month(seed, whereabouts), DAYS * DAY) for seed in range(20)]
+    months = [month(seed, moves, is_at_home) for seed in range(20)]
+    found = [usual_places(*each, DAYS * 24 * HOUR, lambda _: 0) for each in months]
     assert sum(bool(each) for each in found) <= 1
