@@ -27,7 +27,8 @@ from tests.support.memories import asked, each_way, memory_of
 
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
 
-TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
+DOCKED = "/docked"
+LAYOUT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, DOCKED, "/map_ready"}))
 
 
 def drive(start: int, stop: int) -> list[Msg]:
@@ -40,7 +41,7 @@ def every(period_s: float, seconds: float, topic: str, begin: int = T0) -> list[
 
 
 def record(bag_dir: Path, messages: list[Msg]) -> None:
-    write_splits(bag_dir, messages, layout=TRANSIENT)
+    write_splits(bag_dir, messages, layout=LAYOUT)
 
 
 def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
@@ -127,10 +128,6 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
 
 
 T0_S = T0 // S
-
-DOCKED = "/docked"
-
-LAYOUT = McapLayout(latched=frozenset({DOCKED, "/map_ready"}))
 
 
 def docked(second: float, value: bool, topic: str = DOCKED) -> Msg:

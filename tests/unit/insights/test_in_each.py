@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ros2_memory.results import Sightings
 from ros2_memory.tools.arguments import _as_hours
 from ros2_memory.tools.replies import as_json
 from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, memory_of, remembered
 from tests.support.rooms import S, asked_of, draw, write
 
 DAYS = 3
@@ -93,13 +94,17 @@ def test_each_window_has_the_answer_that_it_has_alone(
     assert reply.get("all", {}) == pytest.approx(sums, abs=0.01)
 
 
-def test_a_month_of_dates_has_the_hours_of_its_own_days(tmp_path: Path) -> None:
+def test_a_month_of_dates_has_the_hours_of_its_own_days_and_more_are_refused(
+    tmp_path: Path,
+) -> None:
     ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(-24, 24 * 32)]
-    write_mcap(tmp_path / "bag.mcap", ticks)
-    given = {"topic": "/chatter", "start": "2026-07-14", "end": "2026-08-13", "max_samples": 1}
-    reply = asked(memory_of(tmp_path), "get_topic_in_range", **given, between="20:00-24:00")
+    hours = {"start": "2026-07-14", "end": "2026-08-13", "between": "20:00-24:00"}
+    ask = partial(asked, remembered(tmp_path, ticks), "get_topic_in_range", topic="/chatter")
+    reply = ask(**hours, max_samples=1)
     begins = [row["start"] - MIDNIGHT for row in reply["windows"]]
     assert begins == [day * DAY_S + 20 * 3600 for day in range(31)]
+    refused = ask(**{**hours, "end": "2026-08-14"})
+    assert "between takes at most 31 days: ask about a shorter window" in refused["detail"]
 
 
 def _without_ages(value: Any) -> Any:
@@ -145,14 +150,6 @@ def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder:
     reply = as_json(in_each(memory, Call(), span, hours, ask), folder)
     assert isinstance(reply, dict)
     assert reply["all"] == {"at_least": whole["windows"][0]["total"]}
-
-
-def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None:
-    for day in (0, 40):
-        write(draw(day, 20), tmp_path / f"day_{day}", begin=BEGIN + day * DAY_S)
-    memory = asked_of(tmp_path, stored=False)
-    reply = asked(memory, "visits", where="kitchen", between="19:00-22:00")
-    assert "between takes at most 31 days: ask about a shorter window" in reply["detail"]
 
 
 @pytest.mark.parametrize(
@@ -245,9 +242,7 @@ def test_what_is_nowhere_is_an_error_as_for_one_moment(holed: Memory) -> None:
 
 def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
     messages = [odom((T0 + at) * S, float("nan")) for at in range(3)]
-    messages.append(odom((T0 + 3) * S, 1.0))
-    write_mcap(tmp_path / "a" / "a_0.mcap", messages)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [*messages, odom((T0 + 3) * S, 1.0)])
     told = asked(memory, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
     assert told["notes"] == ["the recorded position is not a number"]
     assert all("notes" not in each for each in told["results"])
@@ -259,9 +254,8 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
 def test_a_window_with_too_many_messages_to_read_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(T0 * S + n * S, n) for n in range(9)])
+    memory = remembered(tmp_path, [odom((T0 + n) * S, n) for n in range(9)])
     window = {"start": T0 * S / S, "end": T0 * S / S + 100, "fields": ["pose.covariance"]}
-    memory = memory_of(tmp_path)
     whole = asked(memory, "get_topic_in_range", topic="/odom", **window)
     assert whole["extremes"]["pose.covariance"]["min"] == 0.0
     monkeypatch.setattr(fields, "MAX_MESSAGES", 3)
