@@ -44,26 +44,16 @@ T0 = T0_S * NS_PER_S
 SCENE = "/vision/scene/scene_objects"
 
 
-def seen(number: int, *labels: str, x: float = 0.0) -> list[Msg]:
-    at = T0 + number * 10 * NS_PER_S
-    return [
-        odom(at, x),
-        detections(at + NS_PER_S, labels, at=(x, 0.0, 0.0)),
-        boolean(at + 2 * NS_PER_S, data=False),
-    ]
-
-
 @pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
+def filled(tmp_path: Path) -> tuple[Memory, NotingReader]:
+    """A memory with a store, and what has been read since that was filled."""
     for number, label in enumerate(["scissors", "cup", "cup", "chair", "cup"]):
-        path = tmp_path / "rec" / f"rec_{number}.mcap"
-        write_mcap(path, seen(number, label, x=float(number * 10)))
-    return tmp_path
-
-
-def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
+        at = T0 + number * 10 * NS_PER_S
+        found = detections(at + NS_PER_S, [label], at=(number, 0.0, 0.0))
+        messages = [odom(at, number), found, boolean(at + 2 * NS_PER_S, data=False)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     reader = NotingReader()
-    memory = with_store(memory_of(bag_dir, reader=reader), bag_dir)
+    memory = memory_of(tmp_path, reader=reader, recalls=True)
     reader.asked.clear()
     return memory, reader
 
@@ -215,9 +205,9 @@ def test_a_bag_beyond_its_share_is_searched_by_its_columns(tmp_path: Path) -> No
     ],
 )
 def test_what_never_was_is_answered_without_reading_a_message(
-    bag_dir: Path, topic: str, condition_type: str, value: JsonValue
+    filled: tuple[Memory, NotingReader], topic: str, condition_type: str, value: JsonValue
 ) -> None:
-    memory, reader = filled(bag_dir)
+    memory, reader = filled
     assert last(memory, condition_type, value, topic=topic).found is None
     assert not any(topics for _, topics in reader.asked)  # but the definitions of types
 
@@ -237,7 +227,7 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     assert "may have held for longer" in str(reply["notes"])
 
 
-def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
+def test_only_the_bag_of_the_match_is_read(filled: tuple[Memory, NotingReader]) -> None:
+    memory, reader = filled
     assert at(last(memory, "contains", "scissors")) == 1
     assert reader.names == ["rec_0.mcap"]

@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.columns import decode
-from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
@@ -33,28 +32,9 @@ from tests.support.bags import (
 from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
-from tests.support.noting_reader import fail_reading
 from tests.support.random_histories import S
 
 T0: Final = 1_700_006_400 * S
-
-
-def test_a_bag_that_fails_is_named_and_the_others_still_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, at in (("a", T0), ("b", T0 + 60 * S)):
-        write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(at)])
-    failure = BagError("a_0.mcap", "the disk returned an error")
-    fail_reading(
-        monkeypatch, "records", lambda path: failure if path.name == failure.path else None
-    )
-    view = View(memory_of(tmp_path), Call())
-    found = view.stream.messages(["/odom"], EVERYTHING)
-    assert [message.time for message in found] == [T0 + 60 * S]
-    assert view.notes.sentences() == (
-        "a/a_0.mcap could not be read to its end: the disk returned an error",
-    )
-    assert not view.notes.complete
 
 
 TOPIC = "/rosout"

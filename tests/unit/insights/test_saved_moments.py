@@ -39,7 +39,6 @@ from tests.support.memories import asked, memory_of
 S = 10**9
 T0 = 1_790_000_000 * S
 NOW = T0 + 60 * S
-RECORDS = QuerySettings(kept=RetentionLimits(10**12, 10**18))
 
 
 @pytest.fixture(autouse=True)
@@ -48,10 +47,11 @@ def _much_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saved_moments, "ANSWER_TIMEOUT_S", 60.0)
 
 
-def remembering(bag_dir: Path, limits: QuerySettings = RECORDS) -> Memory:
+def remembering(bag_dir: Path) -> Memory:
     for n in range(6):
         times = [T0 + (n * 10 + second) * S for second in range(10)]
         write_mcap(bag_dir / f"rec/rec_{n}.mcap", [odom(at, 1.0, 2.0) for at in times])
+    limits = QuerySettings(kept=RetentionLimits(10**12, 10**18))
     return memory_of(bag_dir, clock=SettableClock(NOW), limits=limits)
 
 
@@ -67,10 +67,6 @@ def refusal(memory: Memory, call: Call | None = None) -> str:
     return str(caught.value)
 
 
-def shown(memory: Memory, folder: Path) -> Any:
-    return json.loads(Replies(folder, 24_000).answer(list_moments(memory, Call())).text)
-
-
 def requests(bag_dir: Path) -> list[Path]:
     folder = bag_dir / REQUESTS_FOLDER
     return list(folder.iterdir()) if folder.exists() else []
@@ -84,7 +80,7 @@ def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> Non
     assert (told.label, told.start, told.end) == ("charger found", T0 + 30 * S, NOW)
     assert (told.bags, told.pending) == (3, True)  # its end is just now
     assert requests(tmp_path) == []
-    [moment] = shown(memory, tmp_path)["moments"]
+    [moment] = asked(memory, "list_moments")["moments"]
     size = sum((tmp_path / f"rec/rec_{n}.mcap").stat().st_size for n in (3, 4, 5))
     assert (moment["size_gb"], moment["complete"]) == (round(size / 1e9, 6), False)
     reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
@@ -168,7 +164,7 @@ def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_ke
     missing = ("the share was used up",)
     keep(tmp_path, 1, pending=False, rule="bumper", matches=3, missing=missing)
     memory = memory_of(tmp_path, clock=SettableClock(NOW))
-    told = shown(memory, tmp_path)
+    told = asked(memory, "list_moments")
     [kept] = told["moments"]
     assert (kept["rule"], kept["matches"]) == ("bumper", 3)
     assert (kept["complete"], kept["notes"]) == (False, [*missing])
@@ -214,4 +210,4 @@ def test_the_file_that_keeps_moments_from_being_listed_is_named(
 
 def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:
     (tmp_path / MOMENTS_FOLDER).write_text("no folder")
-    assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
+    assert asked(memory_of(tmp_path), "list_moments") == {"moments": []}

@@ -32,7 +32,7 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
 T0 = 1_784_000_000
@@ -48,11 +48,11 @@ def remembering(
     messages: Sequence[Msg] = DRIVEN,
     *,
     seconds: float = 60,
-    kept: RetentionLimits | None = None,
 ) -> Memory:
     write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
     clock = SettableClock(BEGIN + round(seconds * S))
-    return memory_of(folder, clock=clock, limits=QuerySettings(kept=kept))
+    limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
+    return memory_of(folder, clock=clock, limits=limits)
 
 
 def shown(memory: Memory) -> dict[str, Any]:
@@ -185,24 +185,22 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
 
 
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * 86_400 * S))
+    memory = remembering(tmp_path)
     for counted, derived in ((4_900_000, 4_700_000), (200_000, 50_000)):
         beat(tmp_path, BEGIN + 59 * S, counted_bytes=counted, state_bytes=derived)
         budget = shown(memory)["budget"]
         assert (budget["used_gb"], budget["state_gb"]) == (counted / 1e9, derived / 1e9)
 
 
-@pytest.mark.parametrize("fills", [False, True])
+@each_way
 def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
-    tmp_path: Path, fills: bool
+    tmp_path: Path, recalls: bool
 ) -> None:
     driven = [odom(BEGIN + t * S // 10, t / 20) for t in range(100)]
     bag = write_mcap(tmp_path / "rec" / "rec_0.mcap", driven, McapLayout(chunk_size=3000))
     spoil_chunk(bag, 3)
-    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S))
-    if fills:
-        memory = with_store(memory, tmp_path)
-    else:
+    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S), recalls=recalls)
+    if not recalls:
         assert shown(memory)["doubts"] == SOUND
         asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
     assert shown(memory)["doubts"].startswith("1 bag could not be read whole; data_time")
@@ -296,30 +294,17 @@ def test_nothing_behind_a_link_is_looked_at(tmp_path: Path) -> None:
     assert (absent.files, absent.unreadable) == ((), True)
 
 
-SEEN = "/vision/scene/scene_objects"
-SPLITS, SPLIT = 30, 10
-BLIND = range(10, 19)
-
-
-@pytest.fixture(scope="module", params=[False, True], ids=["without catalogue", "with catalogue"])
-def memory(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Memory:
-    tmp_path = tmp_path_factory.mktemp("bags")
-    messages = [odom(T0 * S + at * S // 2) for at in range(2 * SPLITS * SPLIT)]
+@each_way
+def test_a_recap_has_a_silence_as_an_event(tmp_path: Path, recalls: bool) -> None:
+    messages = [odom(BEGIN + at * S // 2) for at in range(600)]
     messages.append(boolean((T0 + 251) * S, data=True))
-    for at in range(SPLITS * SPLIT):
-        if at // SPLIT not in BLIND:
-            seen = ["cup"] if at < 50 else []
-            messages.append(detections((T0 + at) * S + 1, seen, topic=SEEN))
+    seen = (at for at in range(300) if not 100 <= at < 190)
+    messages += [detections((T0 + at) * S + 1, ["cup"] if at < 50 else []) for at in seen]
     write_splits(tmp_path, messages)
-    clock = SettableClock((T0 + SPLITS * SPLIT + 5) * S)
-    found = memory_of(tmp_path, clock=clock)
-    return with_store(found, tmp_path) if request.param else found
-
-
-def test_a_recap_has_it_as_an_event(memory: Memory) -> None:
+    memory = memory_of(tmp_path, clock=SettableClock((T0 + 305) * S), recalls=recalls)
     reply = asked(memory, "recap", start=T0, end=T0 + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
-    assert event["text"] == f"{SEEN} was silent"
+    assert event["text"] == "/vision/scene/scene_objects was silent"
     assert (event["timestamp"], event["duration_s"]) == (T0 + 99.000001, pytest.approx(91.0))
     assert reply["counts"]["silences"] == 1
     within = asked(memory, "recap", start=T0 + 120, end=T0 + 150)

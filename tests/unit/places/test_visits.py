@@ -105,22 +105,17 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     found = visits(memory, Call(), **pasted)
     [hint] = [each for each in found.notes if "x and y were taken in map" in each]
     assert hint.endswith('get_position_*: ask with frame_id "odom"')
-    replies = [
-        asked(memory, "visits", by="hour", **pasted),
-        asked(memory, "recap", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
-        asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
-        asked(
-            memory,
-            "find_matches",
-            topic="/odom",
-            condition_type="above",
-            value=-1,
-            field="position.x",
-            where=pasted,
-        ),
-    ]
-    assert [str(each).count("x and y were taken in map") for each in replies] == [1] * 4, replies
-    assert all('with frame_id "odom"' in str(each) for each in replies)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 9, "where": pasted}
+    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    for tool, given_ in (
+        ("visits", {**pasted, "by": "hour"}),
+        ("recap", window),
+        ("trajectory_summary", window),
+        ("find_matches", {**driven, "where": pasted}),
+    ):
+        reply = str(asked(memory, tool, **given_))
+        assert reply.count("x and y were taken in map") == 1
+        assert 'with frame_id "odom"' in reply
     for other in ({"frame_id": "odom"}, {"frame_id": "map", "x": 900.0}, {"x": 50.0, "y": 1.0}):
         found = visits(memory, Call(), **pasted | other)
         assert "were taken in" not in str(found.notes)

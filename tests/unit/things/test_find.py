@@ -564,11 +564,6 @@ def test_find_things_answers_from_the_newest_bags_and_says_since_when(
         assert all(str(first) in note for note in told), told
 
 
-@pytest.fixture
-def crowded(tmp_path: Path) -> Memory:
-    return eight_bags(tmp_path)
-
-
 def labels_and_notes(memory: Memory) -> tuple[set[str], list[str]]:
     found = find_things(memory, Call(Deadline.after(60)))
     notes = [note for note in found.notes if "too many sightings" in note]
@@ -585,8 +580,9 @@ class WithoutEstimates(ByteLru[tuple[Timeline, object]]):
 
 
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    crowded = eight_bags(tmp_path)
     scanner = crowded.scanner
     assert scanner is not None
     caches = replace(scanner.caches, things=WithoutEstimates(1 << 20))
@@ -600,10 +596,10 @@ def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
 
 
 def test_of_a_window_before_what_was_compared_no_never_is_said(
-    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(known, "_MOST_SPOTS", 3)
-    start_s = float(begin_of(0))
+    crowded, start_s = eight_bags(tmp_path), float(begin_of(0))
     for labels, seen in (((), THINGS[2:5]), (("thing 0",), ()), (("thing 7",), ())):
         found = find_things(
             crowded, Call(Deadline.after(60)), labels, start_s=start_s, end_s=begin_of(5) - 1
