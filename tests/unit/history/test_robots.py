@@ -26,6 +26,10 @@ def drive(x: float, *, begin: int = 0, delay: int = 0) -> list[Msg]:
     return [odom(at, x, n / 10, log_time=at + delay) for n, at in enumerate(stamps)]
 
 
+def record(bag_dir: Path, name: str, messages: list[Msg]) -> None:
+    write_mcap(bag_dir / name / f"{name}_0.mcap", messages)
+
+
 def mounted(parent: str, at: int = T0) -> Msg:
     return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
 
@@ -78,7 +82,7 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     own = OwnRecordings(tmp_path)
     names = ("rec_20231114T221340Z", "rec_20231114T221330Z")
     for number, name in enumerate(names):
-        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(10.0 * number))
+        record(tmp_path, name, drive(10.0 * number))
         own.begin(name)
         assert own.complete(name)
     memory = memory_of(tmp_path)
@@ -158,9 +162,9 @@ def driving(begin: int, stop: int, x: float) -> list[Msg]:
 def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_recordings(
     tmp_path: Path, recalls: bool
 ) -> None:
-    write_mcap(tmp_path / "run_0" / "run_0_0.mcap", driving(0, 120, 0.0))
+    record(tmp_path, "run_0", driving(0, 120, 0.0))
     # Where the first one ends, by a clock that is set back by 40 s.
-    write_mcap(tmp_path / "run_1" / "run_1_0.mcap", driving(81, 200, 60.5))
+    record(tmp_path, "run_1", driving(81, 200, 60.5))
     memory = memory_of(tmp_path, recalls=recalls)
     window = {"start": T0_S, "end": T0_S + 200}
     told = driven(memory, 0, 200)
@@ -185,7 +189,7 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     write_mcap(run / "run_1_0.mcap", driving(0, 100, 0.0))
     write_mcap(run / "run_1_1.mcap", driving(40, 60, 50.5))
     # What follows begins before the end of the first split by the same clock.
-    write_mcap(tmp_path / "run_2" / "run_2_0.mcap", driving(61, 200, 61.0))
+    record(tmp_path, "run_2", driving(61, 200, 61.0))
     memory = memory_of(tmp_path)
     assert warned(memory) == []
     told = driven(memory, 95, 200)
@@ -214,8 +218,8 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
 def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
     tmp_path: Path, other: list[Msg]
 ) -> None:
-    write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
-    write_mcap(tmp_path / "b" / "b_0.mcap", other)
+    record(tmp_path, "a", drive(0.0))
+    record(tmp_path, "b", other)
     memory = memory_of(tmp_path)
     status = memory_status(memory, Call())
     assert not [note for note in status.notes if "overlap in time" in note]
@@ -231,12 +235,12 @@ def test_two_robots_are_found_behind_however_many_handovers(
     """However long a handover took, and whichever of the two recordings has it."""
     for number in range(5):
         name = f"a{number}"
-        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(0.0, begin=5 * number))
+        record(tmp_path, name, drive(0.0, begin=5 * number))
         if number % 2:
             links = Handover(previous=f"a{number - 1}", next=f"a{number + 1}")
             write_handover(tmp_path / name, links)
     for number, name in enumerate("bc"):
-        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(10.0 * number, begin=900))
+        record(tmp_path, name, drive(10.0 * number, begin=900))
     (note,) = warned(memory_of(tmp_path))
     assert "b, c overlap in time" in note
 
@@ -245,8 +249,8 @@ def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> No
     for number in range(3):
         name = f"boot_{number}"
         poses = [odom((n + 1) * S, 5.0 * number, n / 10) for n in range(61)]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
-    write_mcap(tmp_path / "set" / "set_0.mcap", drive(0.0))
+        record(tmp_path, name, poses)
+    record(tmp_path, "set", drive(0.0))
     memory = memory_of(tmp_path)
     assert warned(memory) == []
     path = asked(memory, "trajectory_summary", start=0, end=70)
@@ -254,9 +258,9 @@ def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> No
 
 
 def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "red" / "red_0.mcap", [mounted("base_link")])
+    record(tmp_path, "red", [mounted("base_link")])
     later = T0 + 3600 * S
-    write_mcap(tmp_path / "blue" / "blue_0.mcap", [mounted("torso", later)])
+    record(tmp_path, "blue", [mounted("torso", later)])
     memory = memory_of(tmp_path)
     (note,) = warned(memory)
     assert "laser is in base_link in the recording red, and in torso in blue" in note
@@ -297,7 +301,7 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
     for speed in (1.0, 2.0):
         name, times = f"run_{speed:.0f}", range(S, 61 * S, S)
         poses = [odom(at, max(n - resting + 1, 0) * speed) for n, at in enumerate(times)]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
+        record(tmp_path, name, poses)
     memory = memory_of(tmp_path)
     (note,) = warned(memory)
     assert "run_1, run_2 overlap in time" in note

@@ -152,37 +152,39 @@ def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder:
     assert reply["all"] == {"at_least": whole["windows"][0]["total"]}
 
 
+AUTUMN = "Europe/Berlin 2026-10-25/2026-10-26"
+SPRING = "Europe/Berlin 2026-03-29/2026-03-30"
+
+
 @pytest.mark.parametrize(
-    ("zone", "days", "hours", "expected"),
+    ("where", "hours", "expected"),
     [
-        ("Europe/Berlin", "2026-10-25/2026-10-26", "02:15-02:45", "02:15-02:45 02:15-02:45"),
-        ("Europe/Berlin", "2026-10-25/2026-10-26", "01:00-02:30", "01:00-02:30 02:00-02:30"),
-        ("Europe/Berlin", "2026-10-25/2026-10-26", "02:15-04:00", "02:15-02:00 02:15-04:00"),
-        ("Europe/Berlin", "2026-10-25/2026-10-26", "01:00-04:00", "01:00-04:00"),
+        (AUTUMN, "02:15-02:45", "02:15-02:45 02:15-02:45"),
+        (AUTUMN, "01:00-02:30", "01:00-02:30 02:00-02:30"),
+        (AUTUMN, "02:15-04:00", "02:15-02:00 02:15-04:00"),
+        (AUTUMN, "01:00-04:00", "01:00-04:00"),
+        (AUTUMN, "03:00-02:30", "00:00-02:30 02:00-02:30 03:00-00:00"),
         (
-            *("Europe/Berlin", "2026-10-25/2026-10-26"),
-            *("03:00-02:30", "00:00-02:30 02:00-02:30 03:00-00:00"),
-        ),
-        (
-            *("Europe/Berlin", "2026-03-28/2026-03-31"),
+            "Europe/Berlin 2026-03-28/2026-03-31",
             *("22:00-04:00", "00:00-04:00 22:00-04:00 22:00-04:00 22:00-00:00"),
         ),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "02:30-03:30", "03:00-03:30"),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "01:30-02:15", "01:30-03:00"),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "02:10-02:50", ""),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "03:00-02:30", "00:00-03:00 03:00-00:00"),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "22:00-24:00", "22:00-00:00"),
-        ("Europe/Berlin", "2026-03-29/2026-03-30", "00:00 - 24:00", "00:00-00:00"),
+        (SPRING, "02:30-03:30", "03:00-03:30"),
+        (SPRING, "01:30-02:15", "01:30-03:00"),
+        (SPRING, "02:10-02:50", ""),
+        (SPRING, "03:00-02:30", "00:00-03:00 03:00-00:00"),
+        (SPRING, "22:00-24:00", "22:00-00:00"),
+        (SPRING, "00:00 - 24:00", "00:00-00:00"),
         # Days that begin in an hour that clocks repeat.
         (
-            *("Atlantic/Azores", "2026-10-25/2026-10-26"),
+            "Atlantic/Azores 2026-10-25/2026-10-26",
             *("00:30-00:30", "00:00-00:30 00:30-00:00 00:00-00:30 00:30-00:00"),
         ),
     ],
 )
 def test_hours_that_clocks_repeat_count_twice_and_those_that_they_skip_are_left_out(
-    zone: str, days: str, hours: str, expected: str
+    where: str, hours: str, expected: str
 ) -> None:
+    zone, days = where.split()
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TZ", zone)
         time.tzset()

@@ -195,8 +195,7 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
     late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
     late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
-    write_splits(tmp_path, [*driving(60, 40), *late])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [*driving(60, 40), *late])
     reply = before(memory, 40.0)
     assert told(reply) == [("warning of a: late", 0.0)]
     assert [(each["text"], each["s_after"]) for each in reply["after"]] == [

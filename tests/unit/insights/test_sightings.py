@@ -98,8 +98,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     ]
     seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
     poses = [odom(BEGIN + at * S, 0.5 * at) for at in range(3)]
-    write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [*placed, *seen, *poses])
     for frame_id in (None, "odom"):
         answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
         [sighting] = answer.sightings
@@ -108,8 +107,8 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         assert sighting.thing.frame_id == (frame_id or "map")
         assert "is in base_link" not in str(answer.notes)
     far = [detections(late + at * S, ["cup"]) for at in range(6, 8)]
-    write_mcap(tmp_path / "bag.mcap", [*placed, *poses, *far])
-    answer = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "cup")
+    memory = remembered(tmp_path, [*placed, *poses, *far])
+    answer = find_matches(memory, Call(), OBJECTS, "contains", "cup")
     assert "no transform leads to map" in str(answer.notes)
 
 
@@ -129,13 +128,11 @@ def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_mess
         turning.append(tf(at, turn))
     shown = detections(BEGIN + shown_s * S, ["cup"], at=(3.0, 0.0, 0.0))
     seen = [replace(shown, log_time=BEGIN + at * S) for at in logged_s]
-    write_splits(tmp_path, [*turning, *seen])
-    memory = memory_of(tmp_path)
-    [row] = asked(memory, "find_matches", topic=OBJECTS, condition_type="contains", value="cup")[
-        "sightings"
-    ]
-    assert tuple(round(row["place"][name], 2) for name in ("x", "y")) == place
-    assert row["place"]["frame_id"] == "map"
+    memory = remembered(tmp_path, [*turning, *seen])
+    [sighting] = find_matches(memory, Call(), OBJECTS, "contains", "cup").sightings
+    assert sighting.thing is not None
+    assert sighting.thing.position[:2] == pytest.approx(place, abs=0.01)
+    assert sighting.thing.frame_id == "map"
 
 
 def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:
@@ -143,8 +140,8 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
         return {"label": label, "score": score, "position": {"x": x, "y": 1.0, "z": 0.0}}
 
     things = [seen("headphones", 0.4, 1.0), seen("phone", 0.8, 2.0), seen("mug", 0.9, 3.0)]
-    write_splits(tmp_path, [text(BEGIN, json.dumps(things), topic="/seen")])
-    [sighting] = find_matches(memory_of(tmp_path), Call(), "/seen", "contains", "phone").sightings
+    memory = remembered(tmp_path, [text(BEGIN, json.dumps(things), topic="/seen")])
+    [sighting] = find_matches(memory, Call(), "/seen", "contains", "phone").sightings
     assert sighting.thing is not None
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 

@@ -19,9 +19,9 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap
+from tests.support.bags import boolean, octets, odom, text, tf, transform
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S
 from tests.support.rooms import BEGIN, ROOMS, asked_of, bounds, draw, write
@@ -150,8 +150,8 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
         octets(MAP_BEGIN, [1] * 60),
         boolean(MAP_BEGIN, True, topic="/dock"),
     ]
-    write_mcap(tmp_path / "rec_0.mcap", [*said_then, text(MAP_BEGIN + S, "cup")])
-    memory = memory_of(tmp_path, recalls=recalls)
+    said_then.append(text(MAP_BEGIN + S, "cup"))
+    memory = remembered(tmp_path, said_then, recalls=recalls)
     cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup", "while": during}
     for by in ({}, {"by": "hour"}):
         refused = asked(memory, "find_matches", **cup, **by)
@@ -164,8 +164,7 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
 ) -> None:
     """Drives 0.5 m/s along x, and turns 0.3 rad/s meanwhile, as a holonomic robot may."""
     messages = [odom(MAP_BEGIN + n * S // 10, n / 20, 0.0, 0.03 * n) for n in range(900)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, messages, recalls=recalls)
     window = {"start": MAP_BEGIN / S, "end": MAP_BEGIN / S + 90}
     where = {"x": [15, 20], "y": [-1, 1]}
     inside = asked(memory, "trajectory_summary", where=where, **window)
@@ -235,8 +234,7 @@ def test_a_path_by_transforms_is_whole_where_a_bag_reaches_from_1970_to_now(
     """The clock was set while it was recorded: of half a million hours two have messages."""
     times = [20 * S, *(MAP_BEGIN + n * S // 10 for n in range(300))]
     poses = [tf(at, transform(at, "odom", "base_link", (1.0, 0, 0))) for at in times]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, poses, recalls=recalls)
     # Each look at the clock takes 10 ms.
     call = Call(Deadline.after(20.0, partial(next, count(0.0, 0.01))))
     found = trajectory_summary(memory, call, TimeRange(0.0, MAP_BEGIN / S + 30))

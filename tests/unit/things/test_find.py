@@ -93,7 +93,7 @@ def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
     return ask(bag_dir, **given)
 
 
-@pytest.mark.parametrize(("recalls", "map_off"), [(False, None), (True, 0.0), (True, 0.6)])
+@pytest.mark.parametrize(("recalls", "map_off"), [(False, None), (True, 0.6)])
 def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
     tmp_path: Path, recalls: bool, map_off: float | None
 ) -> None:
@@ -106,20 +106,15 @@ def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
         *looked(120, 180, HERE, later, **more, map_off=map_off or 0.0),
     ]
     without_poses = [message for message in messages if message.topic != "/odom"]
+    write_splits(tmp_path / "all", messages)
+    write_splits(tmp_path / "without", without_poses)
     replies = []
-    for name, topic, of_robot in (
-        ("poses", "/odom", messages),
-        ("alone", "/odom", without_poses),
-        ("chosen", "/tf", messages),
-    ):
-        write_splits(tmp_path / name, of_robot)
+    for name, topic in (("all", "/odom"), ("without", "/odom"), ("all", "/tf")):
         limits = QuerySettings(pose_topic=topic)
         memory = memory_of(tmp_path / name, limits=limits, recalls=recalls)
-        found = asked(memory, "find_things")
         windows = {"start": BEGIN, "end": BEGIN + 60, "with_start": BEGIN + 120}
-        asked_of = {**windows, "with_end": BEGIN + 180}
-        compared = asked(memory, "compare", **asked_of)
-        replies.append((found, compared["frame_id"], compared["things"]))
+        compared = asked(memory, "compare", **windows, with_end=BEGIN + 180)
+        replies.append((asked(memory, "find_things"), compared["frame_id"], compared["things"]))
     assert replies[0][0]["total"] > 1
     assert replies[0][0]["frame_id"] == ("odom" if map_off is None else "map")
     assert replies[1] == replies[2] == replies[0]
@@ -501,8 +496,7 @@ def test_things_farther_than_any_place_are_not_placed_and_others_are(
     for at in range(BEGIN * S, (BEGIN + 20) * S, S):
         seen = [("mug", 0.9, (far, 0.0, 0.0)), ("cup", 0.9, (1.0, 0.0, 0.0))]
         messages += [odom(at), tf(at, base(at, 0.0, 0.0, 0.0)), detected(at, seen)]
-    write_splits(tmp_path, messages)
-    reply = ask(tmp_path, QuerySettings())
+    reply = told_of(tmp_path, messages, limits=QuerySettings())
     assert reply["labels"] == {"cup": 1}
     assert "could not be placed: mug (20 times" in reply["notes"][0]
 
