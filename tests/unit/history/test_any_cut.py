@@ -226,40 +226,28 @@ def bin_of(at: int, by: str) -> str:
 
 
 def check_numbers(ask: Ask, dated: Mapping[str, list[Plain]]) -> None:
-    """Extremes of numbers, and by the clock also their counts, ends and means."""
+    """Of numbers by the clock: counts, ends, means, and extremes with when each was first."""
     for (topic, field), number in NUMBERS.items():
-        asking = partial(ask, "get_topic_in_range", topic=topic, fields=[field], **SPAN)
-        extremes = asking()["extremes"][field]
-        check_extremes({f"{key}_unix": extremes[key] for key in extremes}, dated[topic], number)
         for by in ("hour", "day"):
-            bins = table(asking(by=by))
+            bins = table(ask("get_topic_in_range", topic=topic, fields=[field], by=by, **SPAN))
             del bins["all"]
             parts = defaultdict(list)
             for row in dated[topic]:
                 parts[bin_of(row.at, by)].append(row)
             assert {name for name, row in bins.items() if row["count"]} == parts.keys()
             for name, rows in parts.items():
-                assert bins[name]["count"] == len(rows)
-                ends = bins[name]["first_unix"], bins[name]["last_unix"]
-                assert ends == (near(rows[0].at), near(rows[-1].at))
-                shown = {key.removeprefix(f"{field}."): each for key, each in bins[name].items()}
-                shown |= {f"{key}_unix": shown[key] for key in ("min", "max")}
-                numbers = check_extremes(shown, rows, number)
-                mean = math.fsum(numbers) / len(numbers) if numbers else None
-                assert shown["mean"] == pytest.approx(mean, abs=0.02)
-
-
-def check_extremes(
-    shown: Mapping[str, Any], rows: Sequence[Plain], number: Callable[[Any], float]
-) -> list[float]:
-    """Checks the least and the greatest number and when each was first; returns all numbers."""
-    known = [(number(row.body), row.at) for row in rows if not math.isnan(number(row.body))]
-    for name, best in (("min", min), ("max", max)):
-        value = best((each for each, _ in known), default=None)
-        at = next((at for each, at in known if each == value), None)
-        expected = (None, None) if at is None else (pytest.approx(value, abs=2e-6), near(at))
-        assert (shown[f"{name}_unix"], shown[f"{name}_at_unix"]) == expected
-    return [each for each, _ in known]
+                shown = bins[name]
+                ends = shown["first_unix"], shown["last_unix"]
+                assert (shown["count"], *ends) == (len(rows), near(rows[0].at), near(rows[-1].at))
+                known = [(number(row.body), row.at) for row in rows]
+                known = [(each, at) for each, at in known if not math.isnan(each)]
+                for key, best in (("min", min), ("max", max)):
+                    value = best((each for each, _ in known), default=None)
+                    at = next((near(at) for each, at in known if each == value), None)
+                    assert shown[f"{field}.{key}"] == pytest.approx(value, abs=2e-6)
+                    assert shown[f"{field}.{key}_at_unix"] == at
+                mean = math.fsum(each for each, _ in known) / len(known) if known else None
+                assert shown[f"{field}.mean"] == pytest.approx(mean, abs=0.02)
 
 
 def runs(rows: Sequence[Plain], holds: Callable[[Any], bool], missed: int) -> list[list[int]]:

@@ -193,7 +193,7 @@ def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
     if has_tf:
         assert x_of(memory, T0 + 4 * S, "map", "base_link") == "frame_unknown"
     else:
-        assert [note for note in answer.notes if "boat has no transforms" in note]
+        assert "boat has no transforms" in str(answer.notes)
 
 
 def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
     assert reply["value"]["position"]["x"] == 50
     assert reply["value_timestamp"] == T0 / S + 9.9
     assert [note for note in reply["notes"] if "/bumper" in note and note.endswith(": r1, r2")]
-    assert not [note for note in reply["notes"] if "the match is of" in note]
+    assert "the match is of" not in str(reply["notes"])
 
 
 def test_frames_are_those_of_the_newest_bags_where_there_is_no_time_for_all(

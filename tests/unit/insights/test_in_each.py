@@ -24,7 +24,6 @@ from tests.support.memories import asked, memory_of, remembered
 from tests.support.rooms import S, asked_of, draw, write
 
 DAYS = 3
-SECONDS = 400
 DAY_S = 86_400
 MIDNIGHT = 1_783_987_200
 BEGIN = MIDNIGHT + 86_400 - 120
@@ -46,7 +45,7 @@ def _in_utc() -> Iterator[None]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bags = tmp_path_factory.mktemp("evenings")
     for day in range(DAYS):
-        write(draw(day, SECONDS), bags / f"day_{day}", begin=BEGIN + day * DAY_S)
+        write(draw(day, 250), bags / f"day_{day}", begin=BEGIN + day * DAY_S)
     return bags
 
 

@@ -130,7 +130,7 @@ def walk(draw: random.Random, count: int, step: float) -> list[tuple[int, float,
     return poses
 
 
-@settings(max_examples=12 if LONG else 4)
+@settings(max_examples=12 if LONG else 2)
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
 @example(seed=2013, split_s=5.0)
 @example(seed=7197, split_s=5.0)
@@ -173,7 +173,7 @@ def test_a_pose_that_cannot_be_decoded_hides_no_visit(
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
-    assert [note for note in found.notes if "cannot be decoded" in note]
+    assert "cannot be decoded" in str(found.notes)
     torn = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
     with pytest.raises(UndecodableError, match="does not fit"):
         visits(remembering(tmp_path / "torn", torn), Call(), 0.0, 0.0)

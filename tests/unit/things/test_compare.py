@@ -30,11 +30,11 @@ LATER = {"start": BEGIN + 60, "end": BEGIN + 89}
 
 def compared(bag_dir: Path, messages: Sequence[Msg], **given: object) -> Any:
     write_splits(bag_dir, messages)
-    return ask_compare(bag_dir, **{**EARLIER, **LATER, **given})
+    return ask(bag_dir, "compare", **{**EARLIER, **LATER, **given})
 
 
-def ask_compare(bag_dir: Path, **given: object) -> Any:
-    return asked(memory_of(bag_dir, limits=NAMED), "compare", **given)
+def ask(bag_dir: Path, tool: str, **given: object) -> Any:
+    return asked(memory_of(bag_dir, limits=NAMED), tool, **given)
 
 
 def labels(reply: Any) -> dict[str, list[str]]:
@@ -62,7 +62,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     later = looked(60, 90, (3.0, 0.0, 0.0), BOOK, in_map=False)
     write_splits(tmp_path / "two", stood, name="first")
     write_splits(tmp_path / "two", later, name="second")
-    reply = ask_compare(tmp_path / "two", **EARLIER, **LATER)
+    reply = ask(tmp_path / "two", "compare", **EARLIER, **LATER)
     assert "stood_at" not in reply
     assert "changes with every start" in str(reply["notes"])
     assert "from one run of odometry to another" in str(reply["notes"])
@@ -71,7 +71,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     assert labels(reply) == {"not_comparable": ["book"]}
     assert (book["was"]["last_seen"], book["is"]["first_seen"]) == (BEGIN + 29, BEGIN + 60)
     write_splits(tmp_path / "one", [*stood, *later])
-    reply = ask_compare(tmp_path / "one", **EARLIER, **LATER)
+    reply = ask(tmp_path / "one", "compare", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
     assert "from one run" not in str(reply.get("notes"))
@@ -89,8 +89,12 @@ def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
     alone = compared(tmp_path / "alone", [*first, *looked(60, 90, HERE)])
     [person] = alone["things"]["movers"]
     assert person.keys() == {"label", "was"}
-    away = ask_compare(
-        tmp_path / "alone", **EARLIER, **LATER, where={"x": 9.0, "y": 9.0, "radius_m": 1.0}
+    away = ask(
+        tmp_path / "alone",
+        "compare",
+        **EARLIER,
+        **LATER,
+        where={"x": 9.0, "y": 9.0, "radius_m": 1.0},
     )
     assert away["things"] == {}
 
@@ -102,16 +106,12 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
     within = {"start": BEGIN + 20, "end": BEGIN + 50, "with_start": BEGIN, "with_end": BEGIN + 89}
     [note] = [each for each in compared(tmp_path, messages, **within)["notes"] if "things" in each]
     assert note.startswith(f"things are not compared after {BEGIN + 50}")
-    until_its_end = ask_compare(tmp_path, **{**within, "end": BEGIN + 89})
+    until_its_end = ask(tmp_path, "compare", **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
     assert "things" not in str(until_its_end["notes"])
 
 
 LABELS: Final = ("mug", "book", "lamp", "bag", "vase", "radio", "plant", "clock")
-
-
-def ask(bag_dir: Path, tool: str, **given: object) -> Any:
-    return asked(memory_of(bag_dir, limits=NAMED), tool, **given)
 
 
 # -- sightings, in many worlds -------------------------------------------------------------------
