@@ -258,26 +258,22 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
     assert "foxglove.Log" not in str(recap.get("notes"))
 
 
-@pytest.mark.parametrize(
-    ("name", "more"),
-    [
-        ("find_matches", {}),
-        ("find_matches", {"by": "day"}),
-        ("find_last_match", {}),
-        ("get_value_when", {"value_topic": "/odom"}),
-    ],
-)
 def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
-    tmp_path: Path, name: str, more: dict[str, str]
+    tmp_path: Path,
 ) -> None:
     memory = remembered(tmp_path, [odom(BEGIN), boolean(BEGIN, True)])
-    asks = {"condition_type": "above", "field": "level", "value": "WARN", **more}
-    topic = "condition_topic" if "value_topic" in more else "topic"
-    missing = asked(memory, name, **asks, **{topic: "/rosout"})
-    assert (missing["error"], missing["reason"]) == ("no_data", "topic_not_recorded")
-    refused = asked(memory, name, **asks, **{topic: "/bumper"})
-    assert refused["error"] == "invalid_arguments"
-    assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]
+    asks = {"condition_type": "above", "field": "level", "value": "WARN"}
+    for name, topic, more in (
+        ("find_matches", "topic", {}),
+        ("find_matches", "topic", {"by": "day"}),
+        ("find_last_match", "topic", {}),
+        ("get_value_when", "condition_topic", {"value_topic": "/odom"}),
+    ):
+        missing = asked(memory, name, **asks, **more, **{topic: "/rosout"})
+        assert (missing["error"], missing["reason"]) == ("no_data", "topic_not_recorded")
+        refused = asked(memory, name, **asks, **more, **{topic: "/bumper"})
+        assert refused["error"] == "invalid_arguments"
+        assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]
 
 
 @each_way

@@ -1,6 +1,5 @@
 """Questions about things over bags, with a robot whose map moves under its odometry."""
 
-import json
 import math
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known, unseen
 from ros2_memory.things.find import find_things
 from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, memory_of, with_store
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -45,27 +44,26 @@ def scene(
     in_map: bool = True,
     score: float = 0.9,
     map_off: float = 0.0,
-    height: float = 0.0,
 ) -> list[Msg]:
     """All messages of one moment: the robot at a pose in the map, and what it detects.
 
-    `map_off` is how far (m, along y) the map has moved under odometry, `height` that of the floor.
+    `map_off` is how far (m, along y) the map has moved under odometry.
     """
     at = BEGIN * S + round(at_s * S)
     x, y, yaw = robot
     ox, oy, turn = OFF if in_map else (0.0, 0.0, 0.0)
     oy += map_off
-    cos, sin = math.cos(-turn), math.sin(-turn)
-    px, py = (x - ox) * cos - (y - oy) * sin, (x - ox) * sin + (y - oy) * cos
+    px, py = turned(x - ox, y - oy, -turn)
     messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
     if in_map:
-        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, height), turn)))
-    cos, sin = math.cos(-yaw), math.sin(-yaw)
-    things = []
-    for label, thing_x, thing_y in seen:
-        dx, dy = thing_x - x, thing_y - y
-        things.append((label, score, (dx * cos - dy * sin, dx * sin + dy * cos, 0.7)))
+        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, 0.0), turn)))
+    things = [(label, score, (*turned(tx - x, ty - y, -yaw), 0.7)) for label, tx, ty in seen]
     return [*messages, detected(at, things)]
+
+
+def turned(x: float, y: float, by: float) -> tuple[float, float]:
+    cos, sin = math.cos(by), math.sin(by)
+    return x * cos - y * sin, x * sin + y * cos
 
 
 def base(at: int, x: float, y: float, yaw: float) -> object:
@@ -146,11 +144,11 @@ def test_a_camera_that_is_turned_away_by_its_own_joint_misses_nothing(
 ) -> None:
     """The robot stands; an empty message names the frame of the camera, too."""
 
-    def seen_by_camera(at: int, turned: float, *things: Seen) -> list[Msg]:
+    def seen_by_camera(at: int, yaw: float, *things: Seen) -> list[Msg]:
         *robot, seen = scene(at, HERE, things)
         seen.body.header.frame_id = "camera"  # type: ignore[attr-defined]
         at_ns = BEGIN * S + at * S
-        camera = transform(at_ns, "base_link", "camera", (0.0, 0.0, 1.0), turned)
+        camera = transform(at_ns, "base_link", "camera", (0.0, 0.0, 1.0), yaw)
         return [*robot, tf(at_ns, camera), seen]
 
     there = [each for at in range(350, 400) for each in seen_by_camera(at, 0.0, ("cup", 3.0, 0.0))]
@@ -339,8 +337,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
     elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
     write_splits(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
-    reply = replied(memory_of(tmp_path, limits=NAMED), "find_things", {"limit": 100})
-    answer = json.loads(reply.text)
+    answer = ask(tmp_path, limit=100)
     [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
     assert (moved["moved_times"], moved["since"]) == (1, moved["last_seen"] - 7.0)
     assert all("since" not in row for row in answer["things"] if row is not moved)
@@ -398,9 +395,9 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
     assert notes[-1] == "it was detected 30 times in all, and not once in this window"
 
 
-@pytest.mark.parametrize(
-    "near",
-    [
+def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path) -> None:
+    write_splits(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)))
+    for near in (
         "",
         {},
         {"radius_m": 2},
@@ -412,13 +409,10 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
         {"label": "mug", "radius": 1},
         [1, 2],
         {"x": [0, 1], "y": [0, 1]},
-    ],
-    ids=str,
-)
-def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path, near: Any) -> None:
-    reply = told_of(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)), near=near)
-    assert reply["error"] == "invalid_arguments"
-    assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
+    ):
+        reply = ask(tmp_path, near=near)
+        assert reply["error"] == "invalid_arguments"
+        assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
 
 
 def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
