@@ -344,8 +344,8 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
         heard = (at for at in range(600) if not any(start <= at < end for start, end in spans))
         messages += [boolean((T0 + at) * S + nth, data=True, topic=topic) for at in heard]
     write_splits(tmp_path, messages)
-    deleted = [("/early", (T0 + at) * S, (T0 + at + 5) * S, 9, "forgotten") for at in (90, 325)]
-    append_losses(tmp_path, [Loss(*each) for each in deleted])
+    for at in (T0 + 90, T0 + 325):
+        append_losses(tmp_path, [Loss("/early", at * S, (at + 5) * S, 9, "forgotten")])
     cut = Counter[str]()
 
     def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from ros2_memory.analysis.sights import CELL_MM, DetectorMessages, Hit, Look, Sights, sights_of
 from ros2_memory.columns.sights import JoinedSights, join_sights, pack_sights
 from ros2_memory.columns.table import Texts
-from ros2_memory.core.arrays import Columns
+from ros2_memory.core.arrays import Columns, Ints
 from ros2_memory.core.model import Vector3
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.things.estimation import Estimate, estimate
-from ros2_memory.things.instances import count_misses
+from ros2_memory.things.estimation import estimate
+from ros2_memory.things.instances import Estimate, count_misses
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.presence import (
     Cells,
@@ -220,7 +219,7 @@ PLACES: Final = np.array([[1000, 1000], [4000, 2000], [7000, 5000], [2000, 8000]
 DAYS: Final = 30
 
 
-def month(seed: int, moves: float, is_at_home: float) -> tuple[NDArray[np.int64], ...]:
+def month(seed: int, moves: float, is_at_home: float) -> tuple[Ints, Ints]:
     """Returns when (ns) and where (mm) a thing was seen that moves at any hour, or goes home."""
     chance = np.random.default_rng(seed)
     times, seen, place = [], [], 0
