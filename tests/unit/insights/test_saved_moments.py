@@ -29,7 +29,7 @@ from ros2_memory.insights.saved_moments import (
 )
 from ros2_memory.results import RememberedMoment
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.replies import Replies, as_json
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
@@ -67,6 +67,10 @@ def refusal(memory: Memory, call: Call | None = None) -> str:
     return str(caught.value)
 
 
+def shown(memory: Memory) -> Any:
+    return as_json(list_moments(memory, Call()), memory.index.bag_dir)
+
+
 def requests(bag_dir: Path) -> list[Path]:
     folder = bag_dir / REQUESTS_FOLDER
     return list(folder.iterdir()) if folder.exists() else []
@@ -80,7 +84,7 @@ def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> Non
     assert (told.label, told.start, told.end) == ("charger found", T0 + 30 * S, NOW)
     assert (told.bags, told.pending) == (3, True)  # its end is just now
     assert requests(tmp_path) == []
-    [moment] = asked(memory, "list_moments")["moments"]
+    [moment] = shown(memory)["moments"]
     size = sum((tmp_path / f"rec/rec_{n}.mcap").stat().st_size for n in (3, 4, 5))
     assert (moment["size_gb"], moment["complete"]) == (round(size / 1e9, 6), False)
     reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
@@ -164,7 +168,7 @@ def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_ke
     missing = ("the share was used up",)
     keep(tmp_path, 1, pending=False, rule="bumper", matches=3, missing=missing)
     memory = memory_of(tmp_path, clock=SettableClock(NOW))
-    told = asked(memory, "list_moments")
+    told = shown(memory)
     [kept] = told["moments"]
     assert (kept["rule"], kept["matches"]) == ("bumper", 3)
     assert (kept["complete"], kept["notes"]) == (False, [*missing])
@@ -210,4 +214,4 @@ def test_the_file_that_keeps_moments_from_being_listed_is_named(
 
 def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:
     (tmp_path / MOMENTS_FOLDER).write_text("no folder")
-    assert asked(memory_of(tmp_path), "list_moments") == {"moments": []}
+    assert shown(memory_of(tmp_path)) == {"moments": []}

@@ -51,8 +51,7 @@ def remembering(
 ) -> Memory:
     write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
     clock = SettableClock(BEGIN + round(seconds * S))
-    limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
-    return memory_of(folder, clock=clock, limits=limits)
+    return memory_of(folder, clock=clock)
 
 
 def shown(memory: Memory) -> dict[str, Any]:
@@ -185,7 +184,8 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
 
 
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
-    memory = remembering(tmp_path)
+    limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
+    memory = replace(remembering(tmp_path), limits=limits)
     for counted, derived in ((4_900_000, 4_700_000), (200_000, 50_000)):
         beat(tmp_path, BEGIN + 59 * S, counted_bytes=counted, state_bytes=derived)
         budget = shown(memory)["budget"]
@@ -356,8 +356,8 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
     memory = memory_of(tmp_path)
     found = asked(memory, "memory_status")["silences"]
     assert [(each["topic"], each["start"] - T0) for each in found] == [
-        ("/late", pytest.approx(329)),
         ("/early", pytest.approx(330)),
+        ("/late", pytest.approx(329)),
         ("/early", pytest.approx(95)),
         ("/late", pytest.approx(79)),
         ("/early", pytest.approx(59)),

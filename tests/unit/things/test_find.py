@@ -423,7 +423,7 @@ def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
     for day in range(14):
         for hour in (7, 8, 9, 15, 16, 17):
             at = first + day * 86_400 + hour * 3600
-            messages += looked(at, at + 2, HERE, table if hour < 12 else shelf)
+            messages += looked(at, at + 4, HERE, table if hour < 12 else shelf)
     write_splits(tmp_path, messages, split_s=86_400.0)
     evening = BEGIN + first + 13 * 86_400 + 18 * 3600
     [mug] = ask(tmp_path, label="mug", end=evening)["things"]
