@@ -37,12 +37,13 @@ from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
-BEGIN = 1_784_000_000 * S
+T0 = 1_784_000_000
+BEGIN = T0 * S
 
 
 def over(memory: Memory, begin: float, end: float) -> Recap:
     """Of so many seconds after BEGIN."""
-    return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+    return recap(memory, Call(), TimeRange(start_s=T0 + begin, end_s=T0 + end))
 
 
 def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
@@ -85,7 +86,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     room, other = Rectangle(-1, 5, -1, 4), Rectangle(50, 51, 50, 51)
     places = Place("room", "odom", room), Place("elsewhere", "odom", other)
     memory = remembered(tmp_path, messages, limits=QuerySettings(places=places))
-    span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
+    span = TimeRange(start_s=T0, end_s=T0 + 70)
     there = recap(memory, Call(), span, where="room")
     # In the room from x = -1 at 15 s to x = 5 at 31 s.
     assert (there.where, there.visits) == ("room", 1)
@@ -103,9 +104,9 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     ]
     never = recap(memory, Call(), span, where="elsewhere")
     assert (never.visits, never.events, never.distance_m, never.stood) == (0, (), 0, 0)
-    refused = asked(memory, "recap", around=BEGIN / S + 20, where="room")
+    refused = asked(memory, "recap", around=T0 + 20, where="room")
     assert refused["error"] == "invalid_arguments"
-    robot = asked(memory, "recap", around=BEGIN / S + 20)["robot"]
+    robot = asked(memory, "recap", around=T0 + 20)["robot"]
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
@@ -116,7 +117,7 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
         body = [odom(begin + n * S // 10, n * 0.05) for n in range(200)]
         body += [boolean(begin + n * S, n < 5, "/bumper") for n in range(20)]
         write_mcap(tmp_path / f"run{run}" / f"run{run}_0.mcap", body)
-    memory, window = memory_of(tmp_path), {"start": BEGIN / S, "end": BEGIN / S + 7220}
+    memory, window = memory_of(tmp_path), {"start": T0, "end": T0 + 7220}
     answer = asked(memory, "recap", **window)
     flips = [each for each in answer["events"] if each["text"].startswith("/bumper")]
     assert [each["text"] for each in flips] == [
@@ -144,7 +145,7 @@ def driving(until: int, stops: float) -> list[Msg]:
 
 
 def before(memory: Memory, around: float, **given: float) -> Any:
-    return asked(memory, "recap", around=BEGIN / S + around, **given)
+    return asked(memory, "recap", around=T0 + around, **given)
 
 
 def told(reply: dict[str, Any]) -> list[tuple[str, float]]:
@@ -299,7 +300,7 @@ def test_what_a_window_first_lists_as_ended_just_did_if_the_message_before_it_is
     messages.sort(key=lambda message: message.log_time)
     found = told_goals(tmp_path, messages, 35, 52, 5, recalls=False)
     assert [text for _, text, *_ in found] == ["/drive goal aborted after 0 s"] * is_told
-    window = {"start": BEGIN / S + 35, "end": BEGIN / S + 52}
+    window = {"start": T0 + 35, "end": T0 + 52}
     searched = found_in(memory_of(tmp_path), "equals", "failed", **window)
     assert [(goal, last) for goal, _, _, last in searched] == [(2, 42)] * is_told
 
@@ -314,7 +315,7 @@ def found_in(
         (
             int(each["value"]["goal"], 16),
             each["value"]["status"],
-            *(each[key] - BEGIN / S for key in ("first_seen", "last_seen")),
+            *(each[key] - T0 for key in ("first_seen", "last_seen")),
         )
         for each in found
     ]
@@ -332,7 +333,7 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
 
     def held(word: str, begin: int, end: int) -> object:
         given = {"topic": TOPIC, "condition_type": "equals", "value": word}
-        window = {"start": BEGIN / S + begin, "end": BEGIN / S + end}
+        window = {"start": T0 + begin, "end": T0 + end}
         rows = asked(memory, "find_matches", **given, **window)["sightings"]
         by_hour = asked(memory, "find_matches", **given, **window, by="hour")
         whole = table(by_hour)["all"]

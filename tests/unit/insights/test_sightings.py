@@ -60,7 +60,7 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 
 def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [detections(BEGIN, ["scissors"])])
-    note = f'"the scissors" was not found, but "scissors" was, last at {BEGIN / S:.6f}'
+    note = f'"the scissors" was not found, but "scissors" was, last at {T0:.6f}'
     found = find_matches(memory, Call(), OBJECTS, "contains", "the scissors")
     assert found.notes == (note,)
 
@@ -226,7 +226,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     assert newest("/rosout", "Error")["value"]["msg"] == "lost"
     for more in ({}, {"field": "status.level"}):
-        assert newest("/diagnostics", "WARN", **more)["timestamp"] == BEGIN / S + 5
+        assert newest("/diagnostics", "WARN", **more)["timestamp"] == T0 + 5
     assert newest("/rosout", "OK", field="status.level")["error"] == "invalid_arguments"
 
 
@@ -251,10 +251,10 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
         [log_entry(BEGIN + (3600 + n) * S, 10 + 10 * n, "node", f"entry {n}") for n in range(5)],
     )
     memory = memory_of(tmp_path)
-    recap = asked(memory, "recap", start=BEGIN // S, end=BEGIN // S + 4)
+    recap = asked(memory, "recap", start=T0, end=T0 + 4)
     [note] = [each for each in recap["notes"] if "foxglove.Log" in each]
     assert 'condition_type "equals", field "level", value 4 lists them' in note
-    recap = asked(memory, "recap", start=BEGIN // S + 3600, end=BEGIN // S + 3604)
+    recap = asked(memory, "recap", start=T0 + 3600, end=T0 + 3604)
     assert "foxglove.Log" not in str(recap.get("notes"))
 
 
@@ -296,12 +296,12 @@ ACTIONS = [(12, "scrub"), (30, "rinse"), (60, ""), (85, "peel"), (110, ""), (130
 
 def written(folder: Path, *, stored: bool = False) -> Memory:
     """Bags with a beat every two seconds, and nothing between 320 and 900 s."""
-    said = [text((T0 + at) * S, words, "/task") for at, words in TASKS]
-    said += [text((T0 + at) * S, words, "/action") for at, words in ACTIONS]
-    beats = [odom((T0 + at) * S, at / 100) for at in range(0, 321, 2)]
-    beats += [boolean((T0 + at) * S, data=at >= 100, topic="/docked") for at in range(0, 320, 2)]
-    later = [odom((T0 + at) * S) for at in range(900, 940, 2)]
-    later.insert(5, text((T0 + 909) * S, "rest", "/task"))
+    said = [text(BEGIN + at * S, words, "/task") for at, words in TASKS]
+    said += [text(BEGIN + at * S, words, "/action") for at, words in ACTIONS]
+    beats = [odom(BEGIN + at * S, at / 100) for at in range(0, 321, 2)]
+    beats += [boolean(BEGIN + at * S, data=at >= 100, topic="/docked") for at in range(0, 320, 2)]
+    later = [odom(BEGIN + at * S) for at in range(900, 940, 2)]
+    later.insert(5, text(BEGIN + 909 * S, "rest", "/task"))
     write_splits(folder, [*said, *beats], 100, "a")
     write_mcap(folder / "c" / "c_0.mcap", later)
     return memory_of(folder, recalls=stored)
@@ -339,7 +339,7 @@ def test_a_number_is_written_as_everywhere_else(
     """A float32 holds 0.10000000149011612 where 0.1 was meant."""
     type_name = f"std_msgs/msg/{kind}"
     said = [make(type_name, data=value) for value in (number, 2.5, number)]
-    messages = [Msg("/number", type_name, (T0 + n) * S, body) for n, body in enumerate(said)]
+    messages = [Msg("/number", type_name, BEGIN + n * S, body) for n, body in enumerate(said)]
     memory = remembered(tmp_path, messages, recalls=recalls)
     given = {"topic": "/number", "start": T0, "end": T0 + 9}
     samples = asked(memory, "get_topic_in_range", **given)["samples"]
@@ -353,7 +353,7 @@ def test_a_number_is_written_as_everywhere_else(
 
 @each_way
 def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: bool) -> None:
-    said = [octets((T0 + n) * S, [n] * 60) for n in range(10)]
+    said = [octets(BEGIN + n * S, [n] * 60) for n in range(10)]
     memory = remembered(tmp_path, said, recalls=recalls)
     given = {"topic": "/octets", "start": T0, "end": T0 + 9}
     for how in ({"changes": True}, {"by": "value"}):

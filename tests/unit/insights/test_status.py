@@ -68,7 +68,7 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     beat(tmp_path, BEGIN + 59 * S)
     told = shown(memory)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
-    assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
+    assert f"no message since {T0 + 10}.000000 but on topics that the" in told["doubts"]
     ahead = BEGIN + 365 * 86_400 * S
     write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead)])
     assert shown(memory)["newest_age_s"] == 50.0
@@ -93,8 +93,8 @@ def lost(kind: Any, begin_s: float, stop_s: float, count: int = 0, topic: str = 
             "wall",
             [lost("refused", 10, 11.5), lost("refused", 13, 14.5)],
             (
-                f"messages of a publisher of /odom were not recorded from {BEGIN // S + 10}.000000"
-                f" to {BEGIN // S + 14}.500000 (4.5 s), as its QoS or type did not fit the "
+                f"messages of a publisher of /odom were not recorded from {T0 + 10}.000000"
+                f" to {T0 + 14}.500000 (4.5 s), as its QoS or type did not fit the "
                 "subscription: how many is not known"
             ),
         ),
@@ -126,14 +126,13 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
             lost("hung", 7 * 86_400, 8 * 86_400, topic="*"),  # the clock was ahead then
         ],
     )
-    after = f"after {BEGIN // S + 49}.000000 messages may be missing, because "
+    after = f"after {T0 + 49}.000000 messages may be missing, because "
     sentence = f"{after}ros2 bag record died, and the recorder ended without a shutdown"
     assert shown(memory)["doubts"] == sentence
     for until, notes in ((45, []), (60, [sentence])):
-        window = {"start": BEGIN / S + 40, "end": BEGIN / S + until}
+        window = {"start": T0 + 40, "end": T0 + until}
         recap = asked(memory, "recap", **window)
         assert [note for note in recap.get("notes", ()) if after in note] == notes
-    (tmp_path / "later").mkdir()
     messages = [odom(BEGIN + t * S) for t in range(55, 60)]
     write_mcap(tmp_path / "later" / "later_0.mcap", messages)
     memory.index.refresh()
@@ -143,13 +142,12 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
 def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     append_losses(tmp_path, [lost("counter", 10, 11, 1), lost("counter", 30, 31, 6)])
-    begin = BEGIN / S
     for start, count in ((0, 1), (12, 0), (25, 6)):
-        window = {"start": begin + start, "end": begin + start + 15}
+        window = {"start": T0 + start, "end": T0 + start + 15}
         found = asked(memory, "get_topic_in_range", topic="/odom", **window)
         notes = [note for note in found.get("notes", ()) if "lost" in note]
         assert [int(note[0]) for note in notes] == [count] * bool(count)
-    asks = {"start": begin, "end": begin + 20, "with_start": begin + 21, "with_end": begin + 45}
+    asks = {"start": T0, "end": T0 + 20, "with_start": T0 + 21, "with_end": T0 + 45}
     notes = asked(memory, "compare", **asks)["notes"]
     assert "from start to end: 1 message lost before it was recorded: /odom (1)" in notes
     assert (
@@ -202,7 +200,7 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S), recalls=recalls)
     if not recalls:
         assert shown(memory)["doubts"] == SOUND
-        asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
+        asked(memory, "trajectory_summary", start=T0, end=T0 + 10)
     assert shown(memory)["doubts"].startswith("1 bag could not be read whole; data_time")
     [note] = asked(memory, "data_time_range")["notes"]
     assert note.startswith("rec/rec_0.mcap: damaged: ")

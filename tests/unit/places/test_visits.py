@@ -39,6 +39,7 @@ from tests.support.memories import asked, each_way, memory_of, remembered, with_
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.tables import table
 
+T0 = 1_784_000_000
 THERE = {"x": 10.0, "y": 0.0, "radius_m": 1.0}
 
 
@@ -92,7 +93,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
     assert [each.restarts for each in answer.visits] == [0, int(not in_map)]
     assert ("odometry restarted" in str(answer.notes)) is not in_map
     assert visits(with_store(memory, tmp_path), Call(), 0.0, 0.0, radius_m=1.0) == answer
-    driven = asked(memory, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 1100)
+    driven = asked(memory, "trajectory_summary", start=T0, end=T0 + 1100)
     assert "odometry restarted" in str(driven["notes"])
     assert "of the jumps" not in str(driven["notes"])
 
@@ -104,7 +105,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     found = visits(memory, Call(), **pasted)
     [hint] = [each for each in found.notes if "x and y were taken in map" in each]
     assert hint.endswith('get_position_*: ask with frame_id "odom"')
-    window = {"start": BEGIN / S, "end": BEGIN / S + 9, "where": pasted}
+    window = {"start": T0, "end": T0 + 9, "where": pasted}
     driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
     for tool, given_ in (
         ("visits", {**pasted, "by": "hour"}),
@@ -138,7 +139,7 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
     """The same times with and without bounds; a visit under way at one of them is marked."""
     draw = random.Random(seed)
     poses = walk(draw, 200, 0.3)
-    start, end = sorted(draw.sample(range(BEGIN // S, poses[-1][0] // S), 2))
+    start, end = sorted(draw.sample(range(T0, poses[-1][0] // S), 2))
     # A window of which nothing was recorded is refused.
     assume(any(start * S <= t <= end * S for t, _, _ in poses))
     with TemporaryDirectory() as folder:
@@ -193,7 +194,6 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
     )
 
 
-T0 = 1_784_000_000
 HERE = {"x": 0.0, "y": 0.0, "radius_m": 1.0}
 PRESSED = {"topic": "/bumper", "condition_type": "equals", "value": True}
 CALM = {"topic": "/mood", "condition_type": "equals", "value": "calm"}
@@ -206,7 +206,7 @@ def life(seconds: int, silent: Mapping[str, Sequence[tuple[int, int]]]) -> list[
     """
     messages: list[Msg] = []
     for step in range(seconds * 5):
-        at = T0 * S + step * S // 5
+        at = BEGIN + step * S // 5
         messages.append(odom(at))
         if step % 5 == 0:
             messages += [boolean(at, True), text(at, "calm", topic="/mood")]
@@ -235,7 +235,7 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
             spans.append((begin, begin + draw.randrange(30)))
     messages = life(120, silent)
     times = {name: [one.log_time for one in messages if one.topic == name] for name in silent}
-    first, last = T0 * S, (T0 + 119) * S
+    first, last = BEGIN, BEGIN + 119 * S
     last = max(last, *times["/odom"][-1:])
     start, end = sorted(T0 + draw.randrange(120) for _ in range(2))
     bounds = first, last, start * S, min(end * S, last)
@@ -381,5 +381,5 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
         assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
         [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
-        assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
+        assert (found["first_seen"] - T0, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
