@@ -231,8 +231,8 @@ def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
 def test_two_robots_are_found_behind_however_many_handovers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robots, "_MAX_PAIRS", 3)
     """However long a handover took, and whichever of the two recordings has it."""
+    monkeypatch.setattr(robots, "_MAX_PAIRS", 3)
     for number in range(5):
         name = f"a{number}"
         record(tmp_path, name, drive(0.0, begin=5 * number))
