@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 from tests.episodes.world import (
     DAY_S,
@@ -33,11 +33,11 @@ LONG = "how long"
 AGO = "how many days ago"
 OFTEN = "how often"
 ENDS = "first and last"
-KINDS: Final = (LISTED, AFTER, BEFORE, DID, USING, EXACT, LONG, AGO, OFTEN, ENDS)
-EACH: Final = 10
+KINDS = (LISTED, AFTER, BEFORE, DID, USING, EXACT, LONG, AGO, OFTEN, ENDS)
+EACH = 10
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Question:
     """A question in words, what it is about, and its true answer.
 

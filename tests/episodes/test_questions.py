@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
@@ -34,10 +34,10 @@ from tests.support.memories import asked, memory_of, with_store
 
 pytestmark = pytest.mark.xdist_group("episodes")
 
-SEED: Final = int(os.environ.get("EPISODIC_SEED", "1"))
-BATTERY: Final = "/battery"
-_SPLIT_NS: Final = 6 * 3600 * 10**9
-_BATTERY_NS: Final = 60 * 10**9
+SEED = int(os.environ.get("EPISODIC_SEED", "1"))
+BATTERY = "/battery"
+_SPLIT_NS = 6 * 3600 * 10**9
+_BATTERY_NS = 60 * 10**9
 
 
 def write_month(seed: int, folder: Path) -> None:
@@ -67,7 +67,7 @@ def _at(row: Msg) -> int:
     return row.log_time
 
 
-_MOST: Final = 100
+_MOST = 100
 
 
 def call_for(question: Question) -> tuple[str, dict[str, Any]]:

@@ -8,28 +8,28 @@ said again while they hold. A night is not recorded, unless a task goes on past 
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from random import Random
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from tests.support.examples import LONG
 
-TASK: Final = "/task"
-ACTION: Final = "/action"
-DAYS: Final = 30 if LONG else 10
-TASKS_A_DAY: Final = 50
-ACTIONS: Final = DAYS * 2000 // 3
-FIRST_DAY: Final = datetime(2026, 11, 1, tzinfo=UTC)
-NOW: Final = FIRST_DAY + timedelta(days=DAYS, hours=9)
+TASK = "/task"
+ACTION = "/action"
+DAYS = 30 if LONG else 10
+TASKS_A_DAY = 50
+ACTIONS = DAYS * 2000 // 3
+FIRST_DAY = datetime(2026, 11, 1, tzinfo=UTC)
+NOW = FIRST_DAY + timedelta(days=DAYS, hours=9)
 """When questions are asked."""
-DAY_S: Final = 86_400
-US_PER_S: Final = 1_000_000
+DAY_S = 86_400
+US_PER_S = 1_000_000
 
-_BEGIN_S: Final = 6 * 3600 + 1800
-_END_S: Final = 23 * 3600
-_LATE: Final = (4, 16)
+_BEGIN_S = 6 * 3600 + 1800
+_END_S = 23 * 3600
+_LATE = (4, 16)
 """Days whose last task ends after midnight."""
-_REPEAT_S: Final = 300.0
+_REPEAT_S = 300.0
 
-USED: Final = {
+USED = {
     "making coffee": ("CoffeeMachine", "Mug", "Spoon"),
     "making coffee cake": ("Bowl", "Oven", "Spoon", "Egg"),
     "making tea": ("Kettle", "Mug", "TeaBag"),
@@ -56,7 +56,7 @@ USED: Final = {
     "tidying the desk": ("Pen", "Book", "Drawer"),
 }
 """Each task, and what its actions use."""
-_VERBS: Final = ("walk to", "look at", "pick up", "put down", "open", "close", "clean")
+_VERBS = ("walk to", "look at", "pick up", "put down", "open", "close", "clean")
 
 
 class Span(NamedTuple):

@@ -8,12 +8,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from typing import Final
 
 from tests.fuzz.good import Good, goods
 from tests.fuzz.mutant import Mutant, Trap, mutant_file
 
-_METADATA: Final = """rosbag2_bagfile_information:
+_METADATA = """rosbag2_bagfile_information:
   version: 5
   storage_identifier: {storage}
   relative_file_paths:
@@ -33,8 +32,8 @@ _METADATA: Final = """rosbag2_bagfile_information:
   compression_format: {compression}
   compression_mode: {mode}
 """
-_BESIDE: Final = ("metadata.yaml", "handover.json", "../recorder.json", "../latched/carried.mcap")
-_NAMES: Final = (
+_BESIDE = ("metadata.yaml", "handover.json", "../recorder.json", "../latched/carried.mcap")
+_NAMES = (
     "two\nlines",
     "tab\tand\rreturn",
     "\u202egab",
@@ -103,7 +102,7 @@ def symlink_loops(rng: Random, good: Good) -> Mutant:
     return mutant
 
 
-_LINKS: Final = (
+_LINKS = (
     (".mcap", "{name}"),
     ("", "."),
     ("", ".."),
@@ -178,7 +177,7 @@ def _empty(path: Path) -> None:
     path.touch()
 
 
-_THINGS: Final[tuple[Callable[[Path], None], ...]] = (
+_THINGS: tuple[Callable[[Path], None], ...] = (
     _folder,
     _pipe,
     _socket,

@@ -2,7 +2,7 @@
 
 import json
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 from mcp.types import TextContent
 
@@ -11,7 +11,7 @@ from tests.fuzz.good import AFTER_S, BASE_S, BEFORE_S, LENGTH_S, TOPICS
 
 Asked = tuple[str, dict[str, Any]]
 
-OF_GOOD: Final[tuple[Asked, ...]] = (
+OF_GOOD: tuple[Asked, ...] = (
     ("get_topic_at_time", {"topic": "/near/odom", "timestamp": BEFORE_S + 1}),
     ("get_position_at", {"topic": "/near/odom", "timestamp": AFTER_S + 1.05}),
     ("get_velocity_at", {"topic": "/near/odom", "timestamp": BEFORE_S + 2}),
@@ -42,7 +42,7 @@ OF_GOOD: Final[tuple[Asked, ...]] = (
 )
 """Questions that only the good bags can answer."""
 
-_LEFT_OUT: Final = ("notes", "clock", "age_s")
+_LEFT_OUT = ("notes", "clock", "age_s")
 """Parts of an answer that may speak of the mutant too, or change with the time of day."""
 
 

@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Final
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -29,13 +28,13 @@ from tests.fuzz.records import (
 )
 from tests.support.bags import Msg, definition, write_db3
 
-_BASE: Final = BASE_S * NS_PER_S
-_MB: Final = 1 << 20
-_BLOCK: Final = 128 << 10
-_SIZES_MB: Final = (1, 8, 30, 60, 130, 255, 300, 1000, 4000)
-_LZ4_SIZES_MB: Final = (1, 8, 30, 60, 130, 255, 300)
+_BASE = BASE_S * NS_PER_S
+_MB = 1 << 20
+_BLOCK = 128 << 10
+_SIZES_MB = (1, 8, 30, 60, 130, 255, 300, 1000, 4000)
+_LZ4_SIZES_MB = (1, 8, 30, 60, 130, 255, 300)
 
-_WIDE: Final = {
+_WIDE = {
     "std_msgs/msg/String": ("string data\n", b"", 1),
     "pkg/msg/Numbers": ("float64[] data\n", b"", 8),
     "pkg/msg/Shorts": ("uint16[] data\n", b"", 2),

@@ -2,7 +2,6 @@
 
 import struct
 from random import Random
-from typing import Final
 
 from mcap.opcode import Opcode
 
@@ -19,8 +18,8 @@ from tests.fuzz.records import (
     without_summary,
 )
 
-_PAGE: Final = 4096
-_SUMMARIZING: Final = frozenset(
+_PAGE = 4096
+_SUMMARIZING = frozenset(
     (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.SUMMARY_OFFSET, Opcode.MESSAGE_INDEX)
 )
 
@@ -176,7 +175,7 @@ def _wrong_number(rng: Random, good: Good) -> Mutant:
     return mutant_of(good, bytes(data))
 
 
-_EXTREMES: Final = (
+_EXTREMES = (
     *(0, 1, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF),
     *(1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 2, (1 << 64) - 1),
 )

@@ -10,14 +10,14 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 from tests.fuzz.classes import Job
 
-HANG_S: Final = 60.0
+HANG_S = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
-_ROOT: Final = Path(__file__).resolve().parents[2]
-_MOST_LEFT_MB: Final = 260
+_ROOT = Path(__file__).resolve().parents[2]
+_MOST_LEFT_MB = 260
 
 
 @dataclass

@@ -3,7 +3,6 @@
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 from tests.fuzz import around, bombs, bytewise, content, definitions, indexes, tables
 from tests.fuzz.good import Good, goods, mcaps, sqlites
@@ -18,7 +17,7 @@ class MutationClass:
     out_of: Callable[[], tuple[Good, ...]] = goods
 
 
-CLASSES: Final[dict[str, MutationClass]] = {
+CLASSES: dict[str, MutationClass] = {
     "bit_flips": MutationClass((bytewise.flip_bits, bytewise.flip_bits_beneath_checksums)),
     "truncation": MutationClass((bytewise.cut, bytewise.cut_inside_a_chunk, bytewise.cut_out)),
     "spliced_chunks": MutationClass((content.splice,)),

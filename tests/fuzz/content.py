@@ -9,7 +9,6 @@ from io import BytesIO
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Final
 
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
@@ -32,9 +31,9 @@ from tests.fuzz.records import (
 from tests.support.bags import Msg, definition, write_db3, write_mcap
 from tests.support.reader_cases import LAYOUTS
 
-_BASE: Final = BASE_S * NS_PER_S
-_PAGE: Final = 4096
-_NUMBERS: Final = (0, 1, 2, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 1 << 26)
+_BASE = BASE_S * NS_PER_S
+_PAGE = 4096
+_NUMBERS = (0, 1, 2, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 1 << 26)
 
 
 def splice(rng: Random, good: Good) -> Mutant:

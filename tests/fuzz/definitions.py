@@ -1,7 +1,6 @@
 """Mutations of message definitions: those that lead back to themselves, and enormous ones."""
 
 from random import Random
-from typing import Final
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.fuzz.content import db3_with
@@ -10,9 +9,9 @@ from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import channel, header, message, schema, without_summary
 from tests.support.bags import Msg
 
-_BASE: Final = BASE_S * NS_PER_S
-_BAR: Final = "=" * 80
-_WIDTHS: Final = (2, 10, 1000, 10**6, 10**9, 10**18)
+_BASE = BASE_S * NS_PER_S
+_BAR = "=" * 80
+_WIDTHS = (2, 10, 1000, 10**6, 10**9, 10**18)
 
 
 def cyclic_definition(rng: Random, good: Good) -> Mutant:
@@ -82,7 +81,7 @@ def _wordy(rng: Random, many: int) -> str:
     )
 
 
-_GIGANTIC: Final = (
+_GIGANTIC = (
     _long,
     _wide,
     _deep,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
 
 import numpy as np
 import zstandard
@@ -32,13 +31,13 @@ from tests.support.bags import (
 from tests.support.reader_cases import LAYOUTS
 from tests.support.shared_bags import REAL, RECORDED
 
-BASE_S: Final = 1_784_023_200
-LENGTH_S: Final = 3
-BEFORE_S: Final = BASE_S - 100
-AFTER_S: Final = BASE_S + 100
-TOPICS: Final = ("/odom", "/tf", "/tf_static", "/chatter", "/bumper", "/scan", "/seen", "/json")
-_LARGEST_SHARED: Final = 120_000
-_DATA: Final = Path(__file__).resolve().parents[1] / "data"
+BASE_S = 1_784_023_200
+LENGTH_S = 3
+BEFORE_S = BASE_S - 100
+AFTER_S = BASE_S + 100
+TOPICS = ("/odom", "/tf", "/tf_static", "/chatter", "/bumper", "/scan", "/seen", "/json")
+_LARGEST_SHARED = 120_000
+_DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections import Counter
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.history.context import Call, Memory
@@ -16,13 +16,13 @@ from tests.fuzz.mutant import Mutant
 from tests.fuzz.oracle import Readable, readable_db3, readable_mcap
 from tests.support.bags import typestore
 
-_PACKED: Final = b"\x28\xb5\x2f\xfd"
-_ASKED: Final = 4
-_OF_ALL: Final = ("/tf", "/tf_static")
+_PACKED = b"\x28\xb5\x2f\xfd"
+_ASKED = 4
+_OF_ALL = ("/tf", "/tf_static")
 """Topics of which the good bags hold messages too."""
-_SLACK_NS: Final = 2_000
+_SLACK_NS = 2_000
 """Unix seconds as floats, rounded to microseconds, are so far from a log time at most."""
-_EXCUSES: Final = (
+_EXCUSES = (
     "could not be read",
     "could not be decoded",
     "left out",

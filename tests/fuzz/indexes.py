@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Final
 
 from mcap.opcode import Opcode
 
@@ -17,8 +16,8 @@ from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import Piece, as_it_was, pieces, with_summary_sealed
 
-_PAIR: Final = 16
-_INDEX_PAGES: Final = (2, 10)
+_PAIR = 16
+_INDEX_PAGES = (2, 10)
 """What the first byte of a page of an index is in sqlite's file format (1.6)."""
 
 

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 from tests.fuzz.good import Good
 
-FOLDER: Final = "mutant"
-LONG_AGO_S: Final = 1_784_030_000
+FOLDER = "mutant"
+LONG_AGO_S = 1_784_030_000
 """When mutants were last written, as far as their mtime tells: nobody is writing them."""
 
 

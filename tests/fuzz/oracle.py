@@ -13,24 +13,24 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
-_MAGIC: Final = b"\x89MCAP0\r\n"
-_LATEST: Final = (1 << 63) - 1
+_MAGIC = b"\x89MCAP0\r\n"
+_LATEST = (1 << 63) - 1
 """This time and later ones are none: no half-open window of 64 bits has them."""
-_LARGEST: Final = 1 << 24
-_PLAIN: Final = (
+_LARGEST = 1 << 24
+_PLAIN = (
     "SELECT count(*) FROM sqlite_master"
     " WHERE lower(name) IN ('topics', 'messages') AND type = 'table' AND rootpage > 0"
 )
-_COMPUTED: Final = (
+_COMPUTED = (
     "SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden UNION"
     " SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden"
 )
-_MOST_ROWS: Final = 20_000
+_MOST_ROWS = 20_000
 
 
 class Readable(NamedTuple):

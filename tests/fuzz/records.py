@@ -4,17 +4,16 @@ import struct
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-MAGIC: Final = MCAP0_MAGIC
-RECORD: Final = struct.Struct("<BQ")
-_FOOTER: Final = struct.Struct("<BQQQI")
-_CHUNK: Final = struct.Struct("<QQQI")
+MAGIC = MCAP0_MAGIC
+RECORD = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
+_CHUNK = struct.Struct("<QQQI")
 
 
 @dataclass(frozen=True)

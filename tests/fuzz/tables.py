@@ -8,13 +8,12 @@ from contextlib import closing, suppress
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Final
 
 from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_of
 
-_TABLES: Final = ("topics", "messages", "message_definitions", "metadata", "schema")
-_COLUMNS: Final = (
+_TABLES = ("topics", "messages", "message_definitions", "metadata", "schema")
+_COLUMNS = (
     "topics.name",
     "topics.type",
     "topics.serialization_format",
@@ -27,7 +26,7 @@ _COLUMNS: Final = (
     "message_definitions.encoded_message_definition",
     "message_definitions.topic_type",
 )
-_ODD_VALUES: Final = (
+_ODD_VALUES = (
     "NULL",
     "''",
     "'text'",
@@ -43,7 +42,7 @@ _ODD_VALUES: Final = (
     "'1784023200000000000'",
     "x'28b52ffd'",
 )
-_FOREVER: Final = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+_FOREVER = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
 
 
 def missing_tables(rng: Random, good: Good) -> Mutant:

@@ -5,7 +5,6 @@ EPISODIC_LONG=1 tries over a hundred times as many, and EPISODIC_SEED others.
 
 import os
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -17,10 +16,10 @@ from tests.fuzz.mutant import mutant_of
 from tests.fuzz.trial import World
 from tests.support.examples import LONG
 
-SEED: Final = int(os.environ.get("EPISODIC_SEED", "1"))
-OF_EACH: Final = 300 if LONG else 2
-OF_INDEXES: Final = 1200 if LONG else 4
-_INDEXES: Final = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
+SEED = int(os.environ.get("EPISODIC_SEED", "1"))
+OF_EACH = 300 if LONG else 2
+OF_INDEXES = 1200 if LONG else 4
+_INDEXES = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import structlog
 
@@ -31,14 +31,14 @@ from tests.fuzz.mutant import LONG_AGO_S, Mutant
 from tests.fuzz.oracle import Readable
 from tests.fuzz.traps import sprung
 
-MOST_S: Final = 10.0
-MOST_MB: Final = 512
-_ASKED_OF_GOOD: Final = 2
-_ASKED_OF_MUTANT: Final = 4
-_RECOVERED_EVERY: Final = 4
-_INDEXED_EVERY: Final = 50
-_MOST_COUNTED: Final = 20_000
-_SERVED_AT_MOST: Final = 20
+MOST_S = 10.0
+MOST_MB = 512
+_ASKED_OF_GOOD = 2
+_ASKED_OF_MUTANT = 4
+_RECOVERED_EVERY = 4
+_INDEXED_EVERY = 50
+_MOST_COUNTED = 20_000
+_SERVED_AT_MOST = 20
 
 
 @dataclass

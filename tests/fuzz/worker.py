@@ -13,15 +13,14 @@ import traceback
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
 
 from tests.fuzz.classes import Job
 from tests.fuzz.trial import Verdict, World, resident_mb, tried
 
-_MUCH_MB: Final = 220
-_MOST_ADDRESSES: Final = 8 << 30
+_MUCH_MB = 220
+_MOST_ADDRESSES = 8 << 30
 """So that what would take all memory of the machine fails here."""
-_COMBINATIONS: Final = (("mcap", False), ("rosbag2", True), ("rosbag2", False), ("mcap", True))
+_COMBINATIONS = (("mcap", False), ("rosbag2", True), ("rosbag2", False), ("mcap", True))
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime
 from functools import partial
 from itertools import chain
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from tests.home.messages import BATTERY, BUMPER, DOCKED
 from tests.home.things import DAY
 from tests.home.truth import Span
 
-_OFF_DOCK: Final = {"topic": DOCKED.topic, "condition_type": "equals", "value": False}
-_BUMPED: Final = {"topic": BUMPER.topic, "condition_type": "equals", "value": True}
+_OFF_DOCK = {"topic": DOCKED.topic, "condition_type": "equals", "value": False}
+_BUMPED = {"topic": BUMPER.topic, "condition_type": "equals", "value": True}
 
 
 def about_places(asked: Asked) -> Iterator[Question]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from itertools import chain, groupby
-from typing import Any, Final
+from typing import Any
 
 from tests.home.asking import Asked, Is, Names, Number, Question, Row, between, since, stays
 from tests.home.camera import PERSON
@@ -11,8 +11,8 @@ from tests.home.things import NEVER_SEEN
 from tests.home.truth import PlaceOfThing, ThingTruth
 from tests.home.world import VISION
 
-_WITHIN_M: Final = 0.4
-_PEOPLE: Final = frozenset({PERSON})
+_WITHIN_M = 0.4
+_PEOPLE = frozenset({PERSON})
 
 
 def about_things(asked: Asked) -> Iterator[Question]:

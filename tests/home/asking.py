@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from tests.home.truth import PlaceOfThing, ThingTruth, Truth
 from tests.home.world import START_S, World
 
 Row: TypeAlias = "dict[str, Any]"
-SINCE: Final = ("since", "from", "first_seen")
+SINCE = ("since", "from", "first_seen")
 
 
 class Expected(Protocol):
@@ -36,7 +36,7 @@ class Expected(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Is:
     """A value that is right alone."""
 
@@ -47,7 +47,7 @@ class Is:
         return given == self.value
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Number:
     """A number, right within a tolerance."""
 
@@ -59,7 +59,7 @@ class Number:
         return abs(given - self.value) <= self.within + 1e-9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Words:
     """A text that holds one of some words, if there are any; else none of others."""
 
@@ -73,7 +73,7 @@ class Words:
         return is_any and not any(word in text for word in self.none_of)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Names:
     """A set of names: all of some, and besides them none but those of others."""
 
@@ -85,7 +85,7 @@ class Names:
         return self.all_of <= {*given} <= self.all_of | self.maybe
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Series:
     """A value for each of some names; a name that is left out counts as 0."""
 
@@ -98,7 +98,7 @@ class Series:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Question:
     """A question in words, the call of the script, and what its reply must have."""
 
@@ -113,7 +113,7 @@ class Question:
         return [(value, expected) for value, expected in given if not expected.accepts(value)]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Asked:
     """What questions are made of: the world, the truth about it, and the calendar."""
 

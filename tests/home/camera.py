@@ -8,7 +8,7 @@ that are near each other are confused, and one label has several spellings.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +19,23 @@ from tests.home.flat import clear_lines
 from tests.home.paths import Pose
 from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS, Thing
 
-CAMERA: Final = (0.15, 0.0, 0.40)
+CAMERA = (0.15, 0.0, 0.40)
 """The camera's position (m) in `base_link`; it looks straight ahead."""
-RANGE_M: Final = (0.4, 4.0)
-HALF_VIEW: Final = math.radians(40.0)
-DROPPED: Final = 0.2
-FALSE: Final = 0.02
-CONFUSED: Final = 0.03
-NEAR_NOISE_M: Final = 0.05
-FAR_NOISE_M: Final = 0.30
+RANGE_M = (0.4, 4.0)
+HALF_VIEW = math.radians(40.0)
+DROPPED = 0.2
+FALSE = 0.02
+CONFUSED = 0.03
+NEAR_NOISE_M = 0.05
+FAR_NOISE_M = 0.30
 """The root mean square of the horizontal error right at the camera, and at the end of its range."""
-PERSON: Final = "person"
-PERSON_Z: Final = 1.1
+PERSON = "person"
+PERSON_Z = 1.1
 
-_VARIANT: Final = 0.25
-_CAPITAL: Final = 0.08
-_PLURAL: Final = 0.05
-_PHANTOM: Final = 0.25  # of the false ones: there is nothing at all
+_VARIANT = 0.25
+_CAPITAL = 0.08
+_PLURAL = 0.05
+_PHANTOM = 0.25  # of the false ones: there is nothing at all
 
 
 class Targets(NamedTuple):

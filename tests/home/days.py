@@ -8,7 +8,7 @@ and each is short: a day of some 20 minutes, at the same hours of the clock.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,27 +16,27 @@ from tests.home.flat import DOCK, HALL_X, ROOMS, SPOTS, Spot, way
 from tests.home.paths import Knots, Path, finished
 from tests.home.things import DAY, HOUR
 
-EXECUTING: Final = 2
-SUCCEEDED: Final = 4
-CANCELED: Final = 5
-ABORTED: Final = 6
-LOW_BATTERY: Final = 0.2
-CLOCK_STEP_S: Final = 8.0
-BUMP_S: Final = 0.8
-SLIP_M: Final = 0.25
+EXECUTING = 2
+SUCCEEDED = 4
+CANCELED = 5
+ABORTED = 6
+LOW_BATTERY = 0.2
+CLOCK_STEP_S = 8.0
+BUMP_S = 0.8
+SLIP_M = 0.25
 """How far the wheels slip when the robot bumps into something."""
 
-_OUTINGS_H: Final = (7.5, 9.0, 10.5, 13.0, 15.0, 17.5, 20.0, 22.0)
-_SHORT_OUTINGS_H: Final = (7.5, 10.5, 13.0, 15.0, 20.0)
-_ROUNDS_H: Final = (7.5, 20.0)
-_BLIND_H: Final = (10 + 5 / 60, 12 + 5 / 60)
-_OUTAGE_UNTIL_H: Final = 17.0
-_POWER_CUT_S: Final = 1500.0
-_GAZES: Final = 6
-_NOTICE_S: Final = 0.3  # from what makes the robot stop until it stands
+_OUTINGS_H = (7.5, 9.0, 10.5, 13.0, 15.0, 17.5, 20.0, 22.0)
+_SHORT_OUTINGS_H = (7.5, 10.5, 13.0, 15.0, 20.0)
+_ROUNDS_H = (7.5, 20.0)
+_BLIND_H = (10 + 5 / 60, 12 + 5 / 60)
+_OUTAGE_UNTIL_H = 17.0
+_POWER_CUT_S = 1500.0
+_GAZES = 6
+_NOTICE_S = 0.3  # from what makes the robot stop until it stands
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Scale:
     """How much of a world there is; the same scale makes the same bytes."""
 
@@ -91,7 +91,7 @@ class Outing(NamedTuple):
     cut: bool = False
 
 
-@dataclass(slots=True)
+@dataclass
 class Life:
     """All that the robot did and all that happened to it."""
 
@@ -109,7 +109,7 @@ class Life:
     clock_step: float = math.inf
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Incidents:
     """On which day what happens that happens once."""
 
@@ -350,8 +350,8 @@ class Person(NamedTuple):
     out: tuple[tuple[float, float], ...]
 
 
-_BEDS: Final = ((9.0, 7.8), (10.2, 7.8), (0.8, 1.6))
-_OUT_H: Final = ((8.5, 17.1), None, (9.2, 12.5))
+_BEDS = ((9.0, 7.8), (10.2, 7.8), (0.8, 1.6))
+_OUT_H = ((8.5, 17.1), None, (9.2, 12.5))
 
 
 def people(scale: Scale) -> list[Person]:

@@ -8,7 +8,7 @@ small error of its own. After a slip it takes the localiser some seconds to noti
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +17,16 @@ from ros2_memory.core.arrays import Floats
 from tests.home.days import SLIP_M, Life, Scale
 from tests.home.paths import Pose
 
-_STEP_S: Final = 1.0
-_DRIFT_M: Final = 0.006
-_DRIFT_RAD: Final = math.radians(0.3)
-_ERROR_M: Final = 0.012
-_ERROR_RAD: Final = math.radians(0.25)
-_UPDATE_M: Final = 0.25
-_UPDATE_RAD: Final = 0.2
-NOTICED_S: Final = 6.0
+_STEP_S = 1.0
+_DRIFT_M = 0.006
+_DRIFT_RAD = math.radians(0.3)
+_ERROR_M = 0.012
+_ERROR_RAD = math.radians(0.25)
+_UPDATE_M = 0.25
+_UPDATE_RAD = 0.2
+NOTICED_S = 6.0
 """How long the localiser needs to notice a slip."""
-AHEAD_S: Final = 0.2
+AHEAD_S = 0.2
 """How far ahead the localiser dates its transforms."""
 
 

@@ -5,7 +5,7 @@ dock in the south to the front door in the north; all other rooms open into it.
 """
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,8 @@ class Spot(NamedTuple):
     y: float
 
 
-HALL: Final = "hall"
-ROOMS: Final[Mapping[str, Room]] = {
+HALL = "hall"
+ROOMS: Mapping[str, Room] = {
     "living room": Room(0.0, 5.0, 0.0, 5.0, (4.3, 2.5)),
     "kitchen": Room(0.0, 5.0, 5.0, 9.0, (4.3, 7.0)),
     HALL: Room(5.0, 7.0, 0.0, 9.0),
@@ -41,14 +41,14 @@ ROOMS: Final[Mapping[str, Room]] = {
     "study": Room(7.0, 12.0, 2.0, 5.0, (7.7, 3.5)),
     "bathroom": Room(7.0, 12.0, 0.0, 2.0, (7.7, 1.1)),
 }
-HALL_X: Final = 6.0
+HALL_X = 6.0
 """The line along which everybody walks through the hall."""
-DOCK: Final = (6.0, 0.6, np.pi / 2)
+DOCK = (6.0, 0.6, np.pi / 2)
 """Where the robot stands while it is docked: x, y (m) and yaw (rad)."""
-DOCK_RADIUS_M: Final = 0.4
-FRONT_DOOR: Final = (6.0, 8.3)
+DOCK_RADIUS_M = 0.4
+FRONT_DOOR = (6.0, 8.3)
 
-SPOTS: Final = (
+SPOTS = (
     Spot("sofa corner", "living room", 3.2, 1.6),
     Spot("bookshelf", "living room", 1.8, 3.4),
     Spot("kitchen table", "kitchen", 3.2, 7.0),
@@ -59,10 +59,10 @@ SPOTS: Final = (
     Spot("bath", "bathroom", 9.2, 1.0),
 )
 
-DINING_CORNER: Final = ((0.2, 5.4), (2.8, 5.4), (2.8, 7.2), (1.6, 8.6), (0.2, 8.6))
+DINING_CORNER = ((0.2, 5.4), (2.8, 5.4), (2.8, 7.2), (1.6, 8.6), (0.2, 8.6))
 """A polygon around the dining table, inside the kitchen."""
 
-_DOOR_M: Final = 1.0
+_DOOR_M = 1.0
 
 
 def _walls() -> NDArray[np.float64]:
@@ -80,7 +80,7 @@ def _walls() -> NDArray[np.float64]:
     return np.array(walls)
 
 
-WALLS: Final = _walls()
+WALLS = _walls()
 
 
 def room_at(x: float, y: float) -> str | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from benchmarks import payloads
@@ -15,22 +15,22 @@ from tests.home.camera import Detected
 from tests.home.drift import AHEAD_S
 from tests.home.world import VISION, Beats, Recording, Stream, World
 
-OPTICAL: Final = "camera_optical_frame"
+OPTICAL = "camera_optical_frame"
 """The frame of the detections: z ahead, x right, y down."""
-TF_STATIC: Final = "/tf_static"
-GOALS: Final = "/navigate_to_pose/_action/status"
-POSE_NOISE_M: Final = 0.002
-POSE_NOISE_RAD: Final = 0.002
+TF_STATIC = "/tf_static"
+GOALS = "/navigate_to_pose/_action/status"
+POSE_NOISE_M = 0.002
+POSE_NOISE_RAD = 0.002
 
-ODOM: Final = Stream("/odom", 0.4, 0.1)
-LOCALISED: Final = Stream("/tf", 1.0, 0.5)
-COMMAND: Final = Stream("/cmd_vel", 0.4, 0.1)
-DOCKED: Final = Stream("/is_docked", 2.0, 0.5)
-BUMPER: Final = Stream("/bumper", 1.0, 0.5)
-BATTERY: Final = Stream("/battery_state", 10.0, 2.0)
-DIAGNOSTICS: Final = Stream("/diagnostics", 2.0, 2.0)
+ODOM = Stream("/odom", 0.4, 0.1)
+LOCALISED = Stream("/tf", 1.0, 0.5)
+COMMAND = Stream("/cmd_vel", 0.4, 0.1)
+DOCKED = Stream("/is_docked", 2.0, 0.5)
+BUMPER = Stream("/bumper", 1.0, 0.5)
+BATTERY = Stream("/battery_state", 10.0, 2.0)
+DIAGNOSTICS = Stream("/diagnostics", 2.0, 2.0)
 
-TYPES: Final = {
+TYPES = {
     "/odom": "nav_msgs/msg/Odometry",
     "/tf": "tf2_msgs/msg/TFMessage",
     TF_STATIC: "tf2_msgs/msg/TFMessage",
@@ -44,11 +44,11 @@ TYPES: Final = {
     "/rosout": "rcl_interfaces/msg/Log",
 }
 """Every topic with its type."""
-TRANSIENT_LOCAL: Final = frozenset({TF_STATIC, GOALS, "/rosout"})
+TRANSIENT_LOCAL = frozenset({TF_STATIC, GOALS, "/rosout"})
 
-_NAN: Final = float("nan")
-_OPTICAL_TURN: Final = (-0.5, 0.5, -0.5, 0.5)
-_STRAIGHT: Final = (0.0, 0.0, 0.0, 1.0)
+_NAN = float("nan")
+_OPTICAL_TURN = (-0.5, 0.5, -0.5, 0.5)
+_STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class Record(NamedTuple):

@@ -7,7 +7,7 @@ distance at any moment are exact.
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ros2_memory.core.arrays import Floats
 from tests.home.flat import way
 
-SPEED: Final = 0.4
-TURNING: Final = 0.9
+SPEED = 0.4
+TURNING = 0.9
 """How fast the robot drives (m/s) and turns (rad/s)."""
-WALKING: Final = 1.0
+WALKING = 1.0
 
 
 class Pose(NamedTuple):
@@ -29,7 +29,7 @@ class Pose(NamedTuple):
     yaw: Floats
 
 
-@dataclass(slots=True)
+@dataclass
 class Knots:
     """A path while it is being made: where it has got to, and all knots so far."""
 

@@ -8,7 +8,6 @@ failed: then its last split ends in the middle of a chunk, without a summary.
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import yaml
@@ -28,9 +27,9 @@ from tests.home.things import LABELS
 from tests.home.truth import places
 from tests.home.world import Recording, World, world_of
 
-_CHUNK_BYTES: Final = 16 * 1024
+_CHUNK_BYTES = 16 * 1024
 
-_TOPICS: Final = [
+_TOPICS = [
     Topic(name, kind, "transient_local" if name in TRANSIENT_LOCAL else "volatile")
     for name, kind in TYPES.items()
 ]
@@ -42,7 +41,7 @@ def write_world(scale: Scale, folder: Path) -> None:
     named = {"places": places(), "labels": {label: [*also] for label, also in LABELS.items()}}
     for kind, content in named.items():
         text = yaml.safe_dump({kind: content}, sort_keys=False, default_flow_style=None)
-        (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
+        (folder / f"{kind}.yaml").write_text(text)
 
 
 def write(scale: Scale, folder: Path) -> None:

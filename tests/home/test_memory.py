@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -16,10 +15,10 @@ from tests.support.examples import LONG
 pytestmark = [pytest.mark.xdist_group("home"), pytest.mark.usefixtures("in_utc")]
 
 SCALE = Scale()
-YEAR: Final = 365
-ASKED: Final = (7, 31, YEAR)
+YEAR = 365
+ASKED = (7, 31, YEAR)
 """At the end of which days is asked; 0 is the first."""
-OF_ALL_DAYS: Final = {"How many recordings were left open by a crash?"}
+OF_ALL_DAYS = {"How many recordings were left open by a crash?"}
 """Later days have crashes of their own."""
 
 

@@ -1,7 +1,6 @@
 """`ros2-memory prove`: over the messages that an answer rests on, the answer is the same."""
 
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -17,10 +16,10 @@ pytestmark = pytest.mark.xdist_group("home")
 
 FROM, UNTIL = ("", "") if LONG else ("T10:20", "T10:50")
 """A long run asks about whole days, another one about half an hour of each."""
-DAY: Final = f"start=2026-03-02{FROM} end=2026-03-02{UNTIL}"
-OTHER_DAY: Final = f"with_start=2026-03-03{FROM} with_end=2026-03-03{UNTIL}"
-SEEN: Final = "topic=*/scene_objects condition_type=contains value=mug"
-QUESTIONS: Final = {
+DAY = f"start=2026-03-02{FROM} end=2026-03-02{UNTIL}"
+OTHER_DAY = f"with_start=2026-03-03{FROM} with_end=2026-03-03{UNTIL}"
+SEEN = "topic=*/scene_objects condition_type=contains value=mug"
+QUESTIONS = {
     "list_recorded_topics": "",
     "data_time_range": "",
     "get_topic_at_time": "topic=/battery_state timestamp=2026-03-02T10:35 tolerance_s=5",
@@ -47,7 +46,7 @@ QUESTIONS: Final = {
 }
 
 
-LIKE_OTHERS: Final = (
+LIKE_OTHERS = (
     *("list_recorded_topics", "data_time_range", "list_frames"),
     *("get_topic_in_last", "recent_trajectory_summary"),
     *(tool for tool in QUESTIONS if tool.endswith("_seconds_ago")),

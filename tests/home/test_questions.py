@@ -4,7 +4,6 @@ import json
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pytest
@@ -25,9 +24,9 @@ pytestmark = [pytest.mark.xdist_group("home"), pytest.mark.usefixtures("in_utc")
 SCALE = Scale()
 MOST_CHARS = 6_000
 """Of a reply: what a planner can take in beside much else."""
-_SAME_M: Final = 0.7
+_SAME_M = 0.7
 """A place that is reported so near to a true one is that one: half of the way to another."""
-_DENIED: Final = "not_seen_where_expected"
+_DENIED = "not_seen_where_expected"
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,14 @@ notebook) are different things; spellings (Mug, coffee mug, mugs) are one.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tests.home.flat import room_at
 
-HOUR: Final = 3600.0
-DAY: Final = 86400.0
+HOUR = 3600.0
+DAY = 86400.0
 
 
 class Place(NamedTuple):
@@ -38,7 +38,7 @@ class Stay(NamedTuple):
     place: Place | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Thing:
     """One object: its label, and all its stays in order, without a gap."""
 
@@ -51,7 +51,7 @@ class Thing:
         return next((stay.place for stay in reversed(self.stays) if stay.start <= t), None)
 
 
-LABELS: Final[Mapping[str, tuple[str, ...]]] = {
+LABELS: Mapping[str, tuple[str, ...]] = {
     "mug": ("coffee mug",),
     "television": ("tv",),
     "plant": ("potted plant",),
@@ -59,9 +59,9 @@ LABELS: Final[Mapping[str, tuple[str, ...]]] = {
     "remote": ("remote control",),
 }
 """Declared spellings of a label, as `labels.yaml` has them."""
-PLURALS: Final[Mapping[str, str]] = {"mug": "mugs", "chair": "chairs", "plant": "plants"}
+PLURALS: Mapping[str, str] = {"mug": "mugs", "chair": "chairs", "plant": "plants"}
 """How the detector writes a label in the plural, now and then, where there is but one."""
-NEAR_NAMES: Final[Mapping[str, str]] = {
+NEAR_NAMES: Mapping[str, str] = {
     "mug": "cup",
     "cup": "mug",
     "phone": "headphones",
@@ -70,12 +70,12 @@ NEAR_NAMES: Final[Mapping[str, str]] = {
     "notebook": "book",
 }
 """Which label the detector confuses with which."""
-NONSENSE: Final = ("dog", "knife", "teddy bear", "skateboard", "suitcase")
+NONSENSE = ("dog", "knife", "teddy bear", "skateboard", "suitcase")
 """Labels of things that are not in the flat."""
-NEVER_SEEN: Final = "umbrella stand"
+NEVER_SEEN = "umbrella stand"
 """A label that no detection has."""
 
-SURFACES: Final = (
+SURFACES = (
     Place("kitchen counter", 3.9, 8.3, 0.9),
     Place("coffee table", 2.4, 2.3, 0.4),
     Place("arm of the sofa", 2.0, 0.6, 0.5),
@@ -93,7 +93,7 @@ SURFACES: Final = (
 )
 """Where movable things are put down; no two nearer than 0.7 m to each other."""
 
-_FIXED: Final = (
+_FIXED = (
     ("dining chair", "chair", 0.8, 6.2, 0.5),
     ("other dining chair", "chair", 2.1, 5.9, 0.5),
     ("desk chair", "chair", 10.7, 3.1, 0.5),
@@ -114,14 +114,14 @@ _FIXED: Final = (
     ("notebook", "notebook", 8.0, 4.7, 0.8),
     ("clock", "clock", 6.8, 4.6, 1.8),
 )
-_CHAIR: Final = (Place("dining table", 0.8, 7.9, 0.5), Place("bedroom", 11.0, 6.0, 0.5))
+_CHAIR = (Place("dining table", 0.8, 7.9, 0.5), Place("bedroom", 11.0, 6.0, 0.5))
 """Where the chair stands that is moved once."""
-_MOVABLE: Final = ("mug", "phone", "keys", "remote", "book", "backpack", "ball", "bottle")
-_OUT: Final = (8.25 * HOUR, 17.2 * HOUR)
+_MOVABLE = ("mug", "phone", "keys", "remote", "book", "backpack", "ball", "bottle")
+_OUT = (8.25 * HOUR, 17.2 * HOUR)
 """The backpack is out of the flat between these times of every day."""
 
 
-@dataclass(slots=True)
+@dataclass
 class _Hand:
     """Moves things about: no surface ever holds two."""
 

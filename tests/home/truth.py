@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,13 +23,13 @@ from tests.home.things import DAY, Place
 from tests.home.world import START_S, World, world_of
 
 Span: TypeAlias = tuple[float, float]
-VIEW_GAP_S: Final = 5.0
+VIEW_GAP_S = 5.0
 """A thing that is in view again within so long was in view all along."""
-_SAMPLE_S: Final = 0.1
-_STOOD_S: Final = 3.0
+_SAMPLE_S = 0.1
+_STOOD_S = 3.0
 
 
-@dataclass(slots=True)
+@dataclass
 class Sight:
     """How one stay of a thing was seen."""
 
@@ -38,7 +38,7 @@ class Sight:
     last_detected: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PlaceOfThing:
     """A stay of a thing: where, from when to when, and how it was seen there."""
 
@@ -48,7 +48,7 @@ class PlaceOfThing:
     sight: Sight
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ThingTruth:
     """A thing with all its stays."""
 
@@ -66,7 +66,7 @@ class ThingTruth:
         ]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Standstill:
     """The robot stood off its dock; `reason` is why it had not meant to, "" where it had."""
 
@@ -78,7 +78,7 @@ class Standstill:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DayTruth:
     """One calendar day (UTC), as far as it was recorded."""
 
@@ -89,7 +89,7 @@ class DayTruth:
     lowest_battery: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Truth:
     """All that is true of a world."""
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,13 @@ from tests.home.drift import Drift
 from tests.home.paths import Pose
 from tests.home.things import Thing
 
-START_S: Final = 1_772_409_600
+START_S = 1_772_409_600
 """When the world begins: Monday, 2026-03-02, 00:00 UTC, in Unix seconds."""
-SPLITS_OF_A_RECORDING: Final = 10
+SPLITS_OF_A_RECORDING = 10
 
-_GOLDEN: Final = 0.6180339887498949
-_VISION_DELAY_S: Final = (0.05, 0.15)
-_DELAY_S: Final = (0.00006, 0.00046)
+_GOLDEN = 0.6180339887498949
+_VISION_DELAY_S = (0.05, 0.15)
+_DELAY_S = (0.00006, 0.00046)
 
 
 class Stream(NamedTuple):
@@ -38,7 +38,7 @@ class Stream(NamedTuple):
         return self.short_period_s if scale.short else self.period_s
 
 
-VISION: Final = Stream("/vision/scene/scene_objects", 1.0, 0.5, _VISION_DELAY_S)
+VISION = Stream("/vision/scene/scene_objects", 1.0, 0.5, _VISION_DELAY_S)
 
 
 class Recording(NamedTuple):

@@ -6,7 +6,6 @@ What follows is another life in the same flat: the robot begins it a minute afte
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -25,10 +24,10 @@ from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, PLENTY, Direct, own_all
 from tests.support.memories import shipped_extractor
 
-DAY_S: Final = 86_400
-_LATER_S: Final = 60
+DAY_S = 86_400
+_LATER_S = 60
 """A robot's clock is set by some seconds in its first days."""
-_BOUNDED: Final = frozenset({"data_time_range", "find_things", "find_matches", "visits"})
+_BOUNDED = frozenset({"data_time_range", "find_things", "find_matches", "visits"})
 
 
 def write_later_days(

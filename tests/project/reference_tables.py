@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import yaml
 from pydantic import TypeAdapter
@@ -29,8 +29,8 @@ from ros2_memory.tools.declaration import Tool
 from tests.support.documented_history import CALLS
 from tests.support.memories import ROOT
 
-SOURCE: Final = ROOT / "src" / "ros2_memory"
-LEVELS: Final = {
+SOURCE = ROOT / "src" / "ros2_memory"
+LEVELS = {
     "debug": "debug",
     "info": "info",
     "warning": "warning",
@@ -43,14 +43,14 @@ LEVELS: Final = {
     "lasting_if_refused": "error",
     "remark": "warning",
 }
-EXPLAINED: Final = {"warn", "remark", "fail", "lasting", "lasting_faults", "lasting_if_refused"}
-OPTIONS: Final[Mapping[str, tuple[str, str, type]]] = {
+EXPLAINED = {"warn", "remark", "fail", "lasting", "lasting_faults", "lasting_if_refused"}
+OPTIONS: Mapping[str, tuple[str, str, type]] = {
     "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
     "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),
     "storage/rosbag2.yaml": ("storage", "", Rosbag2Node),
 }
 """Options of groups that have keys of their own: the section of these, and what holds them."""
-VARIES: Final = {"used_gb", "size_gb", "growth_gb_per_day", "full_in_days", "keeps_days"}
+VARIES = {"used_gb", "size_gb", "growth_gb_per_day", "full_in_days", "keeps_days"}
 """Sizes depend on the compressor's version by some bytes, so they are shown and not compared."""
 
 
@@ -277,7 +277,7 @@ def documented_settings() -> str:
 def keys_of(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
     """Key, default and meaning of each line that has one; links to other keys are passed over."""
     group = ""
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_text().splitlines():
         if found := re.fullmatch(r"(\w+):", line):
             group = f"{found[1]}."
         elif found := re.fullmatch(r"\s*(\w+): (\S.*?)\s+# (.*)", line):
@@ -305,7 +305,7 @@ def _schema_of_settings() -> dict[str, Any]:
 
 def configured_keys() -> set[str]:
     """Every key of the shipped files that holds a value of its own."""
-    whole = yaml.safe_load((ROOT / "config" / "config.yaml").read_text(encoding="utf-8"))
+    whole = yaml.safe_load((ROOT / "config" / "config.yaml").read_text())
     keys = {
         f"{group}.{name}"
         for group, members in whole.items()
@@ -313,7 +313,7 @@ def configured_keys() -> set[str]:
         for name in members
     }
     for file, (group, inner, _) in OPTIONS.items():
-        own = yaml.safe_load((ROOT / "config" / file).read_text(encoding="utf-8"))
+        own = yaml.safe_load((ROOT / "config" / file).read_text())
         keys |= {
             f"{group}.{inner}.{name}" if inner else f"{group}.{name}"
             for name in (own[inner] if inner else own)
@@ -336,7 +336,7 @@ def events() -> list[Event]:
     found = {
         each
         for path in sorted(SOURCE.rglob("*.py"))
-        for each in _events_of(ast.parse(path.read_text(encoding="utf-8")))
+        for each in _events_of(ast.parse(path.read_text()))
     }
     found |= {
         Event(

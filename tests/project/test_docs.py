@@ -13,7 +13,7 @@ from ros2_memory.tools.build import build_tools
 from tests.project.reference_tables import configured_keys
 from tests.support.memories import ROOT
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text()
 SOURCE = ROOT / "src" / "ros2_memory"
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "AGENTS.md", *(ROOT / "docs").rglob("*.md")])
 MAPS = [
@@ -33,13 +33,13 @@ def test_every_key_that_readme_tells_of_exists_and_so_many_tools() -> None:
 
 def anchors(path: Path) -> set[str]:
     """What the headings of a page are linked to as."""
-    headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
 
 
 @EACH
 def test_every_file_section_and_test_that_a_document_names_exists(document: Path) -> None:
-    text, folder = document.read_text(encoding="utf-8"), document.parent
+    text, folder = document.read_text(), document.parent
     linked = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", text)
     named = re.findall(r"`((?:docs|deploy|tests|benchmarks|config)/[\w./-]+\.\w+)", text)
     assert [each for each in linked if not (folder / each).exists()] == []
@@ -51,12 +51,12 @@ def test_every_file_section_and_test_that_a_document_names_exists(document: Path
         if anchor not in anchors(folder / path if path else document)
     ] == []
     for file, name in re.findall(r"(tests/[\w/]+\.py)::(?:\w+::)?(\w+)", text):
-        assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text(encoding="utf-8")), name
+        assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text()), name
 
 
 @pytest.mark.parametrize("document", MAPS, ids=lambda document: document.name)
 def test_every_module_that_a_map_names_exists(document: Path) -> None:
-    text = document.read_text(encoding="utf-8")
+    text = document.read_text()
     named = re.findall(r"`([a-z_0-9/.-]+(?:/|\.py|\.toml|\.yaml))(?:::[\w:]+)?`", text)
     elsewhere = ("moments/", "build/", "tools/mcp.yaml", "topics.yaml", "metadata.yaml")
     paths = [each for each in named if not each.startswith((*elsewhere, "."))]
@@ -68,7 +68,7 @@ def test_every_module_that_a_map_names_exists(document: Path) -> None:
 
 def test_agents_and_the_map_of_the_package_name_every_room() -> None:
     rooms = {each.parent.name for each in SOURCE.glob("*/__init__.py")}
-    agents = (ROOT / "AGENTS.md").read_text(encoding="utf-8")
+    agents = (ROOT / "AGENTS.md").read_text()
     assert [room for room in rooms if f"`{room}/`" not in agents] == []
     mapped = re.findall(r"^    ([a-z_]+) ", ros2_memory.__doc__ or "", re.MULTILINE)
     assert rooms <= {*mapped}

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import anyio
 import duckdb
@@ -33,9 +33,9 @@ from tests.support.forked_commands import write_command
 from tests.support.housekeepers import own_all
 from tests.support.memories import ROOT
 
-DOCUMENTS: Final = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS: Final = Path(sys.executable).parent
-ELSEWHERE: Final = {
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS = Path(sys.executable).parent
+ELSEWHERE = {
     "commands.md/From the command line",  # below
     "forget.md",
     "tools.md",  # test_reference.py
@@ -46,7 +46,7 @@ ELSEWHERE: Final = {
     "tls.md/Caddy",
 }
 """Pages, or sections of them, whose blocks are held by another test."""
-NOT_RUN: Final = {
+NOT_RUN = {
     r"ros2-memory serve ": "tests/integration/test_server_process.py runs it",
     r"ros2-memory up ": "tests/integration/test_up.py runs it",
     r"sudo |journalctl ": "changes the machine: systemd, for root",
@@ -60,9 +60,9 @@ NOT_RUN: Final = {
     r"(\w+=\d+ )?uv run ": "these are the tests, and measurements",
 }
 """Lines that begin so are not run, for this reason."""
-MAY_FAIL: Final = {"ros2-memory doctor"}
+MAY_FAIL = {"ros2-memory doctor"}
 """Where the tests run there is no ROS, which the doctor reports by its exit code."""
-BOUND_S: Final = 240
+BOUND_S = 240
 """How long a block may take where the machine is busy."""
 
 
@@ -84,7 +84,7 @@ class Block:
 
 def blocks_of(path: Path) -> Iterator[Block]:
     heading = ""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text()
     for found in re.finditer(
         r"^##+ ([^\n]+)$|^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL
     ):
@@ -94,7 +94,7 @@ def blocks_of(path: Path) -> Iterator[Block]:
             yield Block(path.name, heading, found[2], found[3])
 
 
-BLOCKS: Final = [block for path in DOCUMENTS for block in blocks_of(path)]
+BLOCKS = [block for path in DOCUMENTS for block in blocks_of(path)]
 
 
 def of(language: str) -> list[Any]:
@@ -153,11 +153,11 @@ def test_every_command_runs(block: Block, home: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-IN_LINES: Final = sorted(
+IN_LINES = sorted(
     {
         words
         for path in DOCUMENTS
-        for span in re.findall(r"`([^`\n]+)`", path.read_text(encoding="utf-8"))
+        for span in re.findall(r"`([^`\n]+)`", path.read_text())
         for words in [tuple(span.split())]
         if words[:1] == ("ros2-memory",) and len(words) > 1
     }
@@ -240,14 +240,14 @@ def stand_ins(home: Path) -> Path:
     """A folder with an `ssh` to this machine, without a network."""
     folder = home / "stand-ins"
     folder.mkdir(exist_ok=True)
-    (folder / "ssh").write_text('#!/bin/sh\nshift\nexec sh -c "$*"\n', encoding="utf-8")
+    (folder / "ssh").write_text('#!/bin/sh\nshift\nexec sh -c "$*"\n')
     (folder / "ssh").chmod(0o755)
     return folder
 
 
 async def asked(program: str, arguments: list[str], env: Mapping[str, str]) -> dict[str, Any]:
     server = StdioServerParameters(command=program, args=arguments, env=dict(env))
-    with Path(os.devnull).open("w", encoding="utf-8") as log:
+    with Path(os.devnull).open("w") as log:
         async with Client(stdio_client(server, errlog=log)) as client:
             result = await client.call_tool("data_time_range", {})
             [content] = result.content
@@ -276,7 +276,7 @@ def test_every_yaml_is_what_its_reader_takes(block: Block, tmp_path: Path) -> No
         "labels": "labels.yaml",
         "rules": "triggers.yaml",
     }[key]
-    like = yaml.safe_load((ROOT / "config" / shipped).read_text(encoding="utf-8"))[key]
+    like = yaml.safe_load((ROOT / "config" / shipped).read_text())[key]
     assert type(value) is type(like)
     if key == "schemas":
         assert value.items() <= like.items()
@@ -295,8 +295,8 @@ def test_the_queries_over_a_fleet_tell_what_each_robot_did(
     assert seen == [("r1", first, last, 18), ("r2", first, last, 18)]
 
 
-FORGET = (ROOT / "docs/how-to/forget.md").read_text(encoding="utf-8")
-PAGE = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")
+FORGET = (ROOT / "docs/how-to/forget.md").read_text()
+PAGE = (ROOT / "docs/reference/commands.md").read_text()
 SECTION = PAGE.partition("## From the command line\n")[2].partition("\n## ")[0]
 SHELL = "".join(re.findall(r"```sh\n(.*?)```", SECTION + FORGET, re.DOTALL))
 COMMANDS = [shlex.split(line, comments=True) for line in SHELL.splitlines()]

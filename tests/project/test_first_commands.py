@@ -12,7 +12,6 @@ import sys
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -23,26 +22,24 @@ pytestmark = pytest.mark.skipif(
     not LONG,
     reason="installs from the network, for a minute: EPISODIC_LONG=1",
 )
-FIRST: Final = re.search(
+FIRST = re.search(
     r"^python3 -m venv .+ros2-memory demo$",
-    (ROOT / "README.md").read_text(encoding="utf-8"),
+    (ROOT / "README.md").read_text(),
     re.MULTILINE,
 )
-HUMBLE: Final = re.search(
+HUMBLE = re.search(
     r"## Ubuntu 22\.04 and Humble\n.*?```sh\n(.+?)```",
-    (ROOT / "docs/how-to/robot.md").read_text(encoding="utf-8"),
+    (ROOT / "docs/how-to/robot.md").read_text(),
     re.DOTALL,
 )
-MANAGED: Final = (
-    "[externally-managed]\nError=To install Python packages, use a virtual environment.\n"
-)
+MANAGED = "[externally-managed]\nError=To install Python packages, use a virtual environment.\n"
 """As Debian's file, in fewer words (PEP 668)."""
-OF_THE_NETWORK: Final = re.compile(
+OF_THE_NETWORK = re.compile(
     r"(https?|no)_proxy|(SSL|PIP|REQUESTS)_\w*(CERT|BUNDLE)\w*", re.IGNORECASE
 )
-SPARING: Final = {"PIP_NO_COMPILE": "1"}
+SPARING = {"PIP_NO_COMPILE": "1"}
 """Python compiles what is imported; pip would compile all modules of all packages."""
-BOUND_S: Final = 600
+BOUND_S = 600
 
 
 def debian_like(folder: Path) -> Path:
@@ -54,7 +51,7 @@ def debian_like(folder: Path) -> Path:
         for each in target.iterdir():
             if each != library and each.name != "EXTERNALLY-MANAGED":
                 (path / each.name).symlink_to(each)
-    (own / "EXTERNALLY-MANAGED").write_text(MANAGED, encoding="utf-8")
+    (own / "EXTERNALLY-MANAGED").write_text(MANAGED)
     (folder / "bin").mkdir()
     program = Path(sys.base_prefix) / "bin" / f"python{sysconfig.get_python_version()}"
     shutil.copy2(program.resolve(), folder / "bin/python3")

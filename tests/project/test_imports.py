@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -14,9 +13,9 @@ from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import own_all
 
-T0: Final = 1_700_000_000 * NS_PER_S
-SERVING: Final = {"mcp", "mcp_types", "sse_starlette", "starlette", "uvicorn"}
-ANSWERING: Final = {
+T0 = 1_700_000_000 * NS_PER_S
+SERVING = {"mcp", "mcp_types", "sse_starlette", "starlette", "uvicorn"}
+ANSWERING = {
     "anyio",
     "numpy",
     "rosbags",
@@ -25,19 +24,19 @@ ANSWERING: Final = {
         for room in ("columns", "history.context", "queries", "serving.dispatch", "tools")
     ),
 }
-CONFIGURING: Final = {"hydra", "omegaconf", "yaml"}
-LOOKING: Final = {"rich", "structlog"}
-DELETING: Final = {
+CONFIGURING = {"hydra", "omegaconf", "yaml"}
+LOOKING = {"rich", "structlog"}
+DELETING = {
     "ros2_memory.recorder.housekeeping",
     "ros2_memory.retention.repair",
     "ros2_memory.retention.saved_moments",
     "ros2_memory.storage.mcap.writer",
 }
-RECORDING: Final = {
+RECORDING = {
     f"ros2_memory.{room}" for room in ("recorder.ros2bag", "recorder.supervisor", "retention.clear")
 }
-FLEET: Final = {"ros2_memory.fleet"}
-PEOPLE: Final = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
+FLEET = {"ros2_memory.fleet"}
+PEOPLE = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
 
 
 @pytest.fixture

@@ -25,8 +25,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ros2_memory.observability.prometheus import MemoryGauges, Metrics
 
-PAGE = (ROOT / "docs/how-to/metrics.md").read_text(encoding="utf-8")
-RULES = yaml.safe_load((ROOT / "deploy/ros2-memory.rules.yml").read_text(encoding="utf-8"))
+PAGE = (ROOT / "docs/how-to/metrics.md").read_text()
+RULES = yaml.safe_load((ROOT / "deploy/ros2-memory.rules.yml").read_text())
 QUERIES = [
     *(rule["expr"] for rule in RULES["groups"][0]["rules"]),
     *re.findall(r"^\| [^|]+ \| `(.*?)` \|$", PAGE, re.MULTILINE),

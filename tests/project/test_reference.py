@@ -31,7 +31,7 @@ HOW = "write it anew with `UPDATE_DOCS=1 uv run pytest -n0 tests/project/test_re
 
 @cache
 def page(name: str) -> str:
-    return (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+    return (FOLDER / f"{name}.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_the_keys_of_the_specification_are_marked_and_have_its_defaults() -> Non
 def test_every_preset_and_every_variable_stands_there() -> None:
     presets = {path.stem for path in (ROOT / "config" / "deployment").glob("*.yaml")}
     assert presets <= set(re.findall(r"^\| `(\w+)` \|", page("configuration"), re.MULTILINE))
-    example = (ROOT / ".env.example").read_text(encoding="utf-8")
+    example = (ROOT / ".env.example").read_text()
     for variable in re.findall(r"^#([A-Z_]+)=", example, re.MULTILINE):
         assert f"`{variable}`" in page("configuration")
 

@@ -108,11 +108,11 @@ def test_the_environment_example_names_every_variable_that_is_read_and_sets_none
     assert not [line for line in lines if line and line[0] != "#"]
 
 
-SERVER: Any = json.loads((ROOT / "server.json").read_text(encoding="utf-8"))
+SERVER: Any = json.loads((ROOT / "server.json").read_text())
 [PACKAGE] = SERVER["packages"]
 SCHEMA = "https://static.modelcontextprotocol.io/schemas/2025-12-11/server.schema.json"
 VALID = jsonschema.Draft7Validator(
-    json.loads((ROOT / "tests/data/mcp_registry/server.schema.json").read_text(encoding="utf-8"))
+    json.loads((ROOT / "tests/data/mcp_registry/server.schema.json").read_text())
 )
 
 
@@ -124,11 +124,11 @@ def test_it_is_valid_by_the_schema_that_it_names() -> None:
 def test_it_names_this_release_of_this_package_on_pypi_whose_readme_names_it() -> None:
     assert (PACKAGE["registryType"], PACKAGE["identifier"]) == ("pypi", PROJECT["name"])
     assert SERVER["version"] == PACKAGE["version"] == PROJECT["version"]
-    readme = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
+    readme = (ROOT / PROJECT["readme"]).read_text()
     assert re.findall(r"mcp-name: (\S+)", readme) == [SERVER["name"]]
 
 
 def test_every_variable_is_one_that_the_programs_read() -> None:
-    example = (ROOT / ".env.example").read_text(encoding="utf-8")
+    example = (ROOT / ".env.example").read_text()
     known = set(re.findall(r"^#([A-Z_]+)=", example, re.MULTILINE))
     assert {variable["name"] for variable in PACKAGE["environmentVariables"]} <= known

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-VISION_DEFINITIONS: Final = {
+VISION_DEFINITIONS = {
     "ros2_vision_interfaces/msg/VisionDetection": (
         "string label\nfloat32 score\ngeometry_msgs/Point point\nint32[4] bbox\n"
     ),
@@ -24,8 +23,8 @@ VISION_DEFINITIONS: Final = {
     ),
     "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
-STATUS_FLAGS: Final = tuple(f"flag_{nth:02}" for nth in range(40))
-_QOS: Final = (
+STATUS_FLAGS = tuple(f"flag_{nth:02}" for nth in range(40))
+_QOS = (
     "- history: unknown\n  depth: 0\n  reliability: reliable\n  durability: {durability}\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -33,11 +32,11 @@ _QOS: Final = (
     "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  avoid_ros_namespace_conventions: false"
 )
-TRANSIENT_LOCAL: Final = _QOS.format(durability="transient_local")
-VOLATILE: Final = _QOS.format(durability="volatile")
+TRANSIENT_LOCAL = _QOS.format(durability="transient_local")
+VOLATILE = _QOS.format(durability="volatile")
 
 
-OTHER_ROBOTS: Final = {
+OTHER_ROBOTS = {
     "turtlesim/msg/Pose": (
         "float32 x\nfloat32 y\nfloat32 theta\nfloat32 linear_velocity\nfloat32 angular_velocity\n"
     ),

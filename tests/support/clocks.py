@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from ros2_memory.core.timebase import Clock, Ns
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FixedClock(Clock):
     """A clock that always returns the same time."""
 

@@ -5,10 +5,9 @@ about (0, 2).
 """
 
 import math
-from typing import Final
 
-TURN_RATE: Final = 0.25  # rad/s
-RADIUS: Final = 2.0  # m
+TURN_RATE = 0.25  # rad/s
+RADIUS = 2.0  # m
 
 
 def position(t: float) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any
 from unittest.mock import patch
 
 from hydra import compose
@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tests.support.measured import untraced
 
-SHIPPED: Final = Path(__file__).resolve().parents[2] / "config"
+SHIPPED = Path(__file__).resolve().parents[2] / "config"
 
 
 def shipped_once() -> ExitStack:

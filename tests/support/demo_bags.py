@@ -4,18 +4,17 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
 
-STARTED_S: Final = 1_784_023_200
+STARTED_S = 1_784_023_200
 """When the robot started, in Unix seconds: it was on its dock."""
-HEARD_AFTER_S: Final = 17
+HEARD_AFTER_S = 17
 """Seconds after its start from which on it is recorded."""
-ASKED_AT_S: Final = STARTED_S + 240.5
+ASKED_AT_S = STARTED_S + 240.5
 
 
 @contextmanager

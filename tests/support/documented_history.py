@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 import anyio
 
@@ -32,11 +31,11 @@ from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorder_at_work
 from tests.support.memories import memory_of
 
-START_S: Final = 1_795_161_600
-RECORDING: Final = "rec_20261120T080000Z"
-NOW: Final = (START_S + 64) * NS_PER_S
-LATCHED: Final = frozenset({"/tf_static"})
-CALLS: Final[dict[str, dict[str, object]]] = {
+START_S = 1_795_161_600
+RECORDING = "rec_20261120T080000Z"
+NOW = (START_S + 64) * NS_PER_S
+LATCHED = frozenset({"/tf_static"})
+CALLS: dict[str, dict[str, object]] = {
     "list_recorded_topics": {"pattern": "/vision/*"},
     "data_time_range": {},
     "get_topic_at_time": {"topic": "/vision/scene/scene_objects", "timestamp": START_S + 30.0},
@@ -93,7 +92,7 @@ CALLS: Final[dict[str, dict[str, object]]] = {
     "remember_moment": {"label": "scissors found", "seconds_before": 30},
 }
 """A call of every tool."""
-MISTAKES: Final[dict[str, tuple[str, dict[str, object]]]] = {
+MISTAKES: dict[str, tuple[str, dict[str, object]]] = {
     "unknown": ("get_topic_at_time", {"topic": "/odm", "timestamp": START_S + 30}),
     "misspelt": ("get_position_seconds_ago", {"second_ago": 10}),
 }
@@ -168,7 +167,7 @@ def shown_files(bag_dir: Path) -> dict[str, str]:
     request = SaveRequest("5f0c" * 8, "scissors found", start, NOW, NOW)
     write_saved_moment(bag_dir, SavedMoment(request, pending=False))
     names = (HEARTBEAT_FILE, HANDOVER_FILE, MOMENT_FILE)
-    return {name: (bag_dir / name).read_text(encoding="utf-8") for name in names}
+    return {name: (bag_dir / name).read_text() for name in names}
 
 
 def heartbeat(now: int) -> Heartbeat:

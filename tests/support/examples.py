@@ -4,11 +4,10 @@ Each run draws other examples, so what many short runs try together is what a lo
 """
 
 import os
-from typing import Final
 
-LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
+LONG = os.environ.get("EPISODIC_LONG") == "1"
 """Whether a run may take hours."""
-_FEWEST: Final = 5
+_FEWEST = 5
 
 
 def examples(full: int) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any, Final
+from typing import Any
 
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S
@@ -30,23 +30,23 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 
-START_S: Final = 1_795_161_600
-NOW: Final = (START_S + 600) * NS_PER_S
-LENGTH_S: Final = 60
-LABELS: Final = ("mug", "scissors", "table")
-SEEN: Final = "/vision/scene/scene_objects"
-MOST_CHARS: Final = 10**6
+START_S = 1_795_161_600
+NOW = (START_S + 600) * NS_PER_S
+LENGTH_S = 60
+LABELS = ("mug", "scissors", "table")
+SEEN = "/vision/scene/scene_objects"
+MOST_CHARS = 10**6
 
-_AT: Final[dict[str, object]] = {"timestamp": START_S + 205, "tolerance_s": 200}
-_AGO: Final[dict[str, object]] = {"seconds_ago": 10}
-_SPAN: Final[dict[str, object]] = {"start": START_S, "end": START_S + 300}
-_FRAMES: Final[dict[str, object]] = {"parent": "map", "child": "base_link"}
-MUG: Final[dict[str, object]] = {
+_AT: dict[str, object] = {"timestamp": START_S + 205, "tolerance_s": 200}
+_AGO: dict[str, object] = {"seconds_ago": 10}
+_SPAN: dict[str, object] = {"start": START_S, "end": START_S + 300}
+_FRAMES: dict[str, object] = {"parent": "map", "child": "base_link"}
+MUG: dict[str, object] = {
     "topic": "/vision/*",
     "condition_type": "contains",
     "value": "mug",
 }
-CALLS: Final[dict[str, dict[str, object]]] = {
+CALLS: dict[str, dict[str, object]] = {
     "get_topic_at_time": {"topic": "/is_docked", **_AT},
     "get_topic_seconds_ago": {"topic": "/is_docked", **_AGO},
     "get_topic_in_range": {"topic": "/is_docked", **_SPAN},
@@ -72,7 +72,7 @@ CALLS: Final[dict[str, dict[str, object]]] = {
     "visits": {"where": {"x": 1, "y": 2, "radius_m": 2}},
 }
 """Arguments with which a tool answers about some seeded robot; others need none."""
-TOOLS: Final = [tool.name for tool in build_tools(QuerySettings())]
+TOOLS = [tool.name for tool in build_tools(QuerySettings())]
 
 
 @dataclass(frozen=True)

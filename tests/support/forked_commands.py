@@ -20,12 +20,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-ADDRESS: Final = "EPISODIC_FORKING"
+ROOT = Path(__file__).resolve().parents[2]
+ADDRESS = "EPISODIC_FORKING"
 """The variable that tells workers the name of the socket, an abstract one without its NUL."""
-_CALLER: Final = """\
+_CALLER = """\
 #!{python} -IS
 import json, os, signal, socket, sys
 with socket.socket(socket.AF_UNIX) as peer:

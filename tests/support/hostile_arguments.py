@@ -2,17 +2,17 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from tests.support.robot_run import ANSWERED, T0_S
 
-DEEP: Final = 10_000
+DEEP = 10_000
 """Levels of nesting: past what Python's own recursion allows."""
 
-MEGABYTE: Final = 1_000_000
+MEGABYTE = 1_000_000
 
 
 def nested(levels: int, *, kind: str = "list") -> Any:
@@ -23,7 +23,7 @@ def nested(levels: int, *, kind: str = "list") -> Any:
     return value
 
 
-NUMBERS: Final = [
+NUMBERS = [
     math.nan,
     math.inf,
     -math.inf,
@@ -43,7 +43,7 @@ NUMBERS: Final = [
     T0_S * 1000,
     T0_S * 10**9,
 ]
-TEXTS: Final = [
+TEXTS = [
     "",
     " ",
     "x" * MEGABYTE,
@@ -74,7 +74,7 @@ TEXTS: Final = [
     "contains",
     "near_position",
 ]
-OTHERS: Final = [
+OTHERS = [
     None,
     True,
     False,

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
@@ -32,7 +32,7 @@ from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, START_S
 from tests.support.memories import extractor, memory_of, with_store
 
-LATER: Final = (START_S + 86_400) * NS_PER_S
+LATER = (START_S + 86_400) * NS_PER_S
 
 
 def write_bag(bag_dir: Path, number: int, *, at_s: int | None = None, most: int = 3) -> Path:

@@ -4,14 +4,13 @@ import dataclasses
 import keyword
 import math
 from collections.abc import Callable, Container, Iterator, Sequence
-from typing import Final
 
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Table, Texts
 
-FILLER: Final = "structure_needs_at_least_one_member"
-TIMES: Final = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
+FILLER = "structure_needs_at_least_one_member"
+TIMES = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 
 
 class Comparison:

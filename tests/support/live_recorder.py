@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import anyio
 from mcp import Client
@@ -37,7 +37,7 @@ from tests.support.robot_run import ask
 from tests.support.ros_processes import ros_environment, running, wait_for
 from tests.support.served import Served, serving
 
-RECORDED_TOPICS: Final = (
+RECORDED_TOPICS = (
     "/odom",
     "/tf",
     "/tf_static",
@@ -46,9 +46,9 @@ RECORDED_TOPICS: Final = (
     "/battery_state",
     "/vision/scene/scene_objects",
 )
-NS_PER_S: Final = 10**9
-_OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION")
-_OF_THE_MACHINE: Final = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR")
+NS_PER_S = 10**9
+_OURS = ("MEMORY_", "MCP_", "ROS_VISION")
+_OF_THE_MACHINE = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR")
 
 
 class Child(NamedTuple):

@@ -5,7 +5,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
@@ -14,9 +14,9 @@ from mcap.writer import Writer
 
 from tests.support.bags import McapLayout, Msg, text
 
-SMALL: Final = McapLayout(chunk_size=400)
-RECORD: Final = struct.Struct("<BQ")
-FOOTER: Final = struct.Struct("<BQQQI")
+SMALL = McapLayout(chunk_size=400)
+RECORD = struct.Struct("<BQ")
+FOOTER = struct.Struct("<BQQQI")
 
 
 def chatter(count: int, start: int = 0) -> list[Msg]:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.machinery import SourceFileLoader
 from operator import attrgetter
 from types import ModuleType
-from typing import Final, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 from unittest.mock import patch
 
 import pytest
@@ -19,7 +19,7 @@ from coverage import Coverage
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-UNMEASURED: Final = (
+UNMEASURED = (
     "cli/test_forget.py",
     "cli/test_plot.py",
     "columns/test_fill.py",
@@ -72,7 +72,7 @@ UNMEASURED: Final = (
 They ask much of everything at once, of hours of poses, or of programs over and over, and what they
 run others run too: the lines and branches that they alone reach are 4 % of all.
 """
-FOREIGN: Final = (
+FOREIGN = (
     "omegaconf:OmegaConf.load",
     "pyiceberg.catalog.sql:SqlCatalog.create_table",
     "pyiceberg.catalog.sql:SqlCatalog.load_table",
@@ -87,7 +87,7 @@ FOREIGN: Final = (
 
 While they were traced, `unit/lake` and `unit/cli` spent most of what is measured of them there.
 """
-DRAWN: Final = "hypothesis"
+DRAWN = "hypothesis"
 """The mark of tests that draw their examples: the same lines many times, so not measured either."""
 
 

@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @cache
 def shipped_schemas() -> dict[str, dict[str, str]]:
-    text = (ROOT / "config" / "message_schemas.yaml").read_text(encoding="utf-8")
+    text = (ROOT / "config" / "message_schemas.yaml").read_text()
     schemas: dict[str, dict[str, str]] = yaml.safe_load(text)["schemas"]
     return schemas
 

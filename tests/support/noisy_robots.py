@@ -2,7 +2,6 @@
 
 from pathlib import Path
 from random import Random
-from typing import Final
 
 from tests.support.bags import (
     Msg,
@@ -17,10 +16,10 @@ from tests.support.bags import (
 )
 from tests.support.moving_map import BEGIN, MS, S, moving_map
 
-LENGTH_S: Final = 60
-NOISY_LABELS: Final = ("mug", "scissors", "table", "ghost")
-_NOISE_M: Final = 0.01
-_DRIFT_M: Final = 0.0005
+LENGTH_S = 60
+NOISY_LABELS = ("mug", "scissors", "table", "ghost")
+_NOISE_M = 0.01
+_DRIFT_M = 0.0005
 _RUNNING, _SUCCEEDED, _ABORTED = 2, 4, 6
 
 

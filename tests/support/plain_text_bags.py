@@ -26,19 +26,19 @@ def plain(
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = ["BAG", *(f"{topic} nav_msgs/msg/Odometry {time}" for time in times)]
     lines += [f"{name} nav_msgs/msg/Odometry -" for name in silent]
-    path.write_text("\n".join([*lines, "END" if closed else ""]), encoding="utf-8")
+    path.write_text("\n".join([*lines, "END" if closed else ""]))
     return path
 
 
 def grow(path: Path, *times: int) -> None:
     """Appends messages to an open bag, as its recorder does."""
-    with path.open("a", encoding="utf-8") as stream:
+    with path.open("a") as stream:
         stream.writelines(f"/odom nav_msgs/msg/Odometry {time}\n" for time in times)
 
 
 def close(path: Path) -> None:
     """Closes an open bag in place."""
-    with path.open("a", encoding="utf-8") as stream:
+    with path.open("a") as stream:
         stream.write("END")
 
 
@@ -86,7 +86,7 @@ class PlainReader(McapReader):
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text()
     except FileNotFoundError as error:
         raise BagVanishedError(str(path), "it is gone") from error
     except OSError as error:

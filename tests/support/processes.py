@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import uvicorn
 
@@ -19,13 +19,13 @@ from ros2_memory.serving.connection_limits import (
 
 T = TypeVar("T")
 
-PATIENCE_S: Final = 180.0
+PATIENCE_S = 180.0
 """How long any condition is waited for, and any program to end, before it counts as vain.
 
 No promise of the product: where all is well nobody waits for so long, and a machine that has more
 to do than it has processors may need most of it to start one program.
 """
-LONGEST_PAUSE_S: Final = 0.05
+LONGEST_PAUSE_S = 0.05
 """Between two looks at a condition that is waited for."""
 
 
@@ -51,7 +51,7 @@ def until(what: Callable[[], T | None], name: str = "", *, timeout_s: float = PA
         pause_s = min(1.2 * pause_s, LONGEST_PAUSE_S)
 
 
-BOUND_S: Final = PATIENCE_S
+BOUND_S = PATIENCE_S
 """No test waits longer for what it expects."""
 
 

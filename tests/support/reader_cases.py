@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import zstandard
 from mcap.writer import CompressionType, IndexType
@@ -19,10 +19,10 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
 
 T = TypeVar("T")
-NO_CHUNK_INDEX: Final = IndexType.ATTACHMENT | IndexType.MESSAGE | IndexType.METADATA
-NO_MESSAGE_INDEX: Final = IndexType.ATTACHMENT | IndexType.CHUNK | IndexType.METADATA
+NO_CHUNK_INDEX = IndexType.ATTACHMENT | IndexType.MESSAGE | IndexType.METADATA
+NO_MESSAGE_INDEX = IndexType.ATTACHMENT | IndexType.CHUNK | IndexType.METADATA
 
-LAYOUTS: Final = {
+LAYOUTS = {
     "default": McapLayout(),
     "small chunks": McapLayout(chunk_size=200),
     "zstd": McapLayout(chunk_size=200, compression=CompressionType.ZSTD),
@@ -112,10 +112,10 @@ def _compressed(
     return path
 
 
-MCAP: Final = [
+MCAP = [
     Shelf(f"mcap: {name}", McapReader, partial(_mcap, layout)) for name, layout in LAYOUTS.items()
 ]
-ROSBAG2: Final = [
+ROSBAG2 = [
     Shelf("rosbag2: mcap", Rosbag2Reader, partial(_mcap, McapLayout())),
     Shelf("rosbag2: db3", Rosbag2Reader, _db3, ".db3", keeps_publish_time=False),
     Shelf(
@@ -132,11 +132,11 @@ ROSBAG2: Final = [
         keeps_publish_time=False,
     ),
 ]
-COUNTING: Final = [
+COUNTING = [
     Shelf(
         "counting: mcap",
         lambda: BagDirReader(McapReader()),
         partial(_mcap, McapLayout(chunk_size=200)),
     )
 ]
-FILES: Final = MCAP + ROSBAG2 + COUNTING
+FILES = MCAP + ROSBAG2 + COUNTING

@@ -14,16 +14,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final
 
 import pytest
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-ROS_NAMES: Final = ("ROS", "RMW", "RCUTILS", "FASTDDS", "FASTRTPS", "AMENT", "COLCON", "CMAKE")
+ROOT = Path(__file__).resolve().parents[2]
+ROS_NAMES = ("ROS", "RMW", "RCUTILS", "FASTDDS", "FASTRTPS", "AMENT", "COLCON", "CMAKE")
 """How the names of environment variables begin that are a ROS installation's, or the robot's."""
-FINDING_S: Final = 600.0
-_PYTHONS: Final = ("python3", "/usr/bin/python3")
-_PROBE: Final = "import rclpy, sys; print(sys.executable, *sys.version_info[:2])"
+FINDING_S = 600.0
+_PYTHONS = ("python3", "/usr/bin/python3")
+_PROBE = "import rclpy, sys; print(sys.executable, *sys.version_info[:2])"
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import rclpy
@@ -57,10 +56,10 @@ from tests.support.bags import (
 )
 from tests.support.ros_types import publisher
 
-RADIUS: Final = 2.0  # m
-TURN_RATE: Final = 0.25  # rad/s
-SEEN: Final = {"table": (0.0, math.inf), "cup": (5.0, 30.0), "scissors": (12.0, 18.0)}
-TYPES: Final = {
+RADIUS = 2.0  # m
+TURN_RATE = 0.25  # rad/s
+SEEN = {"table": (0.0, math.inf), "cup": (5.0, 30.0), "scissors": (12.0, 18.0)}
+TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/px4/position": "px4_msgs/msg/VehicleLocalPosition",
     "/odom": "nav_msgs/msg/Odometry",
@@ -73,14 +72,14 @@ TYPES: Final = {
     "/camera/image_raw": "sensor_msgs/msg/Image",
     "/speech": "std_msgs/msg/String",
 }
-UNASKED: Final = {"/clock", "/px4/position", "/camera/image_raw", "/speech"}
+UNASKED = {"/clock", "/px4/position", "/camera/image_raw", "/speech"}
 """Topics that it publishes only where they are named."""
 # What a subscriber on a busy machine has not taken yet: seconds of the quickest topic.
-DEPTH: Final = 1000
-_PER_SECOND: Final = {"/bumper": 2.0, "/battery_state": 1.0, "/vision/scene/scene_objects": 1.0}
-WORTH_TELLING_S: Final = 0.05
-ACKED_WITHIN_S: Final = 60  # of a subscriber that lives; one that was killed is given up before
-_SENSORS: Final = {"laser": (0.10, 0.0, 0.20), "camera": (0.15, 0.0, 0.30)}
+DEPTH = 1000
+_PER_SECOND = {"/bumper": 2.0, "/battery_state": 1.0, "/vision/scene/scene_objects": 1.0}
+WORTH_TELLING_S = 0.05
+ACKED_WITHIN_S = 60  # of a subscriber that lives; one that was killed is given up before
+_SENSORS = {"laser": (0.10, 0.0, 0.20), "camera": (0.15, 0.0, 0.30)}
 
 
 def pose(t: float) -> tuple[float, float, float]:

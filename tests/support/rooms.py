@@ -9,21 +9,21 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from random import Random
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import Memory
 from tests.support.bags import Msg, detected, odom, text, write_splits
 from tests.support.memories import memory_of, with_store
 
-S: Final = 10**9
-BEGIN: Final = 1_784_000_000
-SEEN: Final = "/vision/scene/scene_objects"
-STEP_M: Final = 0.5
-ROOMS: Final = {"kitchen": (0.0, 3.0), "hall": (3.0, 6.0), "den": (9.0, 12.0)}
+S = 10**9
+BEGIN = 1_784_000_000
+SEEN = "/vision/scene/scene_objects"
+STEP_M = 0.5
+ROOMS = {"kitchen": (0.0, 3.0), "hall": (3.0, 6.0), "den": (9.0, 12.0)}
 """From which x to which; between hall and den there is none."""
-_TARGETS: Final = (1.25, 4.25, 7.25, 10.25)
-PLACES: Final = {"cup": (1.5, 0.5), "cat": (4.5, 0.5), "cat bed": (10.5, 0.5)}
+_TARGETS = (1.25, 4.25, 7.25, 10.25)
+PLACES = {"cup": (1.5, 0.5), "cat": (4.5, 0.5), "cat bed": (10.5, 0.5)}
 """Where things are (m, in odom), by label."""
 
 

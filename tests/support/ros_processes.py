@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
@@ -24,9 +24,9 @@ from tests.support.real_recorder import (
     RealRecorder,
 )
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
-_DOMAINS: Final = range(1, 102)  # those whose ports lie below the ephemeral ones (ROS_DOMAIN_ID)
+ROOT = Path(__file__).resolve().parents[2]
+SHARED_MEMORY = Path("/dev/shm")  # noqa: S108
+_DOMAINS = range(1, 102)  # those whose ports lie below the ephemeral ones (ROS_DOMAIN_ID)
 
 
 @contextmanager

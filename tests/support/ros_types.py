@@ -13,18 +13,18 @@ wheels' include folder; so this is for `rmw_fastrtps_cpp` only.
 import ctypes
 from functools import cache
 from importlib import import_module
-from typing import Any, Final
+from typing import Any
 
 from nav_msgs.msg import Path as Lender
 
-_SERIALIZER: Final = b"rosidl_typesupport_fastrtps_c"
+_SERIALIZER = b"rosidl_typesupport_fastrtps_c"
 # What describes the fields. Jazzy's middleware refuses a type without it; of a type that has no
 # wheel it is told the lender's fields, which nobody reads.
-_DESCRIBER: Final = b"rosidl_typesupport_introspection_c"
+_DESCRIBER = b"rosidl_typesupport_introspection_c"
 # Newer ones look for it too, go on without it, and leave an error set, which the next one would be
 # printed with.
 _reset_error = ctypes.CDLL("librcutils.so").rcutils_reset_error
-_KEPT: Final[list[object]] = []  # the middleware keeps pointers to these for ever
+_KEPT: list[object] = []  # the middleware keeps pointers to these for ever
 
 
 class _TypeSupport(ctypes.Structure):
@@ -54,8 +54,8 @@ class _TypeHash(ctypes.Structure):
     _fields_ = (("version", ctypes.c_uint8), ("value", ctypes.c_uint8 * 32))
 
 
-_HandleFor: Final = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
-_GetHash: Final = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
+_HandleFor = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
+_GetHash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
 _pointer_in = ctypes.pythonapi.PyCapsule_GetPointer
 _pointer_in.restype, _pointer_in.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
 _capsule = ctypes.pythonapi.PyCapsule_New

@@ -53,7 +53,7 @@ class Served:
 
     def events(self) -> list[dict[str, Any]]:
         """What was logged so far; the last line may be on its way."""
-        whole, _, _ = self.log.read_text(encoding="utf-8").rpartition("\n")
+        whole, _, _ = self.log.read_text().rpartition("\n")
         return [json.loads(line) for line in whole.splitlines()]
 
 
@@ -76,7 +76,7 @@ def serving(
         served = Served(process, 0, log)
 
         def port() -> int | None:
-            assert process.poll() is None, log.read_text(encoding="utf-8")
+            assert process.poll() is None, log.read_text()
             heard = (each["port"] for each in served.events() if each["event"] == "listening")
             return next(heard, None)
 

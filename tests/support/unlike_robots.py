@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from random import Random
-from typing import Final
 
 import numpy as np
 
@@ -23,9 +22,9 @@ from tests.support.bags import (
 from tests.support.moving_map import BEGIN, S, moving_map
 from tests.support.noisy_robots import write_noisy_robot
 
-LENGTH_S: Final = 60
-YEAR_NS: Final = 365 * 86_400 * S
-SPLIT_S: Final = 12
+LENGTH_S = 60
+YEAR_NS = 365 * 86_400 * S
+SPLIT_S = 12
 
 
 def _write(bag_dir: Path, messages: list[Msg]) -> Path:
@@ -114,16 +113,16 @@ def two_cameras(bag_dir: Path) -> Path:
     return _write(bag_dir, messages)
 
 
-DAMAGED: Final = (1, 3)
+DAMAGED = (1, 3)
 """The numbers of the damaged robot's bags that are."""
-SEEN: Final = {
+SEEN = {
     "behind": "cup",
     "damaged": "mug",
     "diver": "wreck",
     "lost": "mug",
     "twin": "knife",
 }
-ROBOTS: Final[Mapping[str, Callable[[Path], Path]]] = {
+ROBOTS: Mapping[str, Callable[[Path], Path]] = {
     "behind": a_year_behind,
     "damaged": damaged,
     "diver": underwater,

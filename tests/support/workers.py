@@ -9,13 +9,12 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Final
 
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
-TESTS: Final = Path(__file__).parents[1]
-GROUPS: Final[Mapping[str, Sequence[str]]] = {
+TESTS = Path(__file__).parents[1]
+GROUPS: Mapping[str, Sequence[str]] = {
     "live": ("integration/test_live_*.py", "integration/test_recorder_triggers.py"),
     "stalls": (
         "integration/test_recorder_exclusion.py",
@@ -30,14 +29,14 @@ The first three mostly wait for real time, for about the same time. "heavy" burn
 one such test at a time leaves some to those that wait.
 """
 
-WORKERS: Final = 5
+WORKERS = 5
 """On two cores: three mostly wait for real time at first, and the others leave no core idle."""
 
-PUNCTUAL: Final = ("live", "stalls", "recorder")
+PUNCTUAL = ("live", "stalls", "recorder")
 """Groups whose programs are to run when their time has come, whatever else there is to do."""
 
-_MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
-_LASTING: Final = re.compile(r'scope="(module|session)"')
+_MARK = re.compile(r'xdist_group\("(\w+)"\)')
+_LASTING = re.compile(r'scope="(module|session)"')
 
 
 def workers_for(args: Sequence[str]) -> int:
