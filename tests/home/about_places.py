@@ -3,13 +3,11 @@
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from datetime import datetime
-from functools import partial
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
-from tests.home.asking import Asked, Is, Number, Question, Row, Series, Words, bins, in_words
+from tests.home.asking import Asked, Question, Series, Words, bins, in_words, near
 from tests.home.flat import HALL, ROOMS, room_at
 from tests.home.messages import BATTERY, BUMPER, DOCKED
 from tests.home.things import DAY
@@ -31,14 +29,6 @@ def _within(spans: Sequence[Span], start: float, end: float) -> list[Span]:
     return [(max(a, start), min(b, end)) for a, b in spans if a < end and b > start]
 
 
-def _entries(reply: Row) -> Any:
-    return reply["total"]
-
-
-def _sighting(reply: Row) -> Any:
-    return reply["sightings"][0]
-
-
 def _visited(asked: Asked) -> Iterator[Question]:
     truth, last = asked.truth, asked.last
     today = asked.day(last), asked.day(last + 1)
@@ -54,8 +44,8 @@ def _visited(asked: Asked) -> Iterator[Question]:
         "visits",
         {"where": "front door", "limit": 1},
         [
-            (Number(door[0], 5.0), lambda reply: reply["visits"][0]["arrived"]),
-            (Number(truth.elapsed(*door), 5.0), lambda reply: reply["visits"][0]["duration_s"]),
+            (near(door[0], 5.0), "visits.0.arrived"),
+            (near(truth.elapsed(*door), 5.0), "visits.0.duration_s"),
         ],
     )
     minutes = minutes_in("kitchen", today)
@@ -63,13 +53,13 @@ def _visited(asked: Asked) -> Iterator[Question]:
         "How many minutes were you in the kitchen today?",
         "visits",
         {"where": "kitchen", "limit": 1, **asked.today},
-        [(Number(minutes, 0.2 + 0.03 * minutes), lambda reply: reply["minutes"])],
+        [(near(minutes, 0.2 + 0.03 * minutes), "minutes")],
     )
     yield Question(
         "How many times did you go into the bedroom today?",
         "visits",
         {"where": "bedroom", "limit": 1, **asked.today},
-        [(Is(len(_within(truth.visits["bedroom"], *today))), _entries)],
+        [(len(_within(truth.visits["bedroom"], *today)), "total")],
     )
     spent = {name: minutes_in(name, day) for name in truth.visits}
     yield Question(
@@ -78,7 +68,7 @@ def _visited(asked: Asked) -> Iterator[Question]:
         asked.days(last - 1, max(last, 1)),
         [
             (
-                Series({name: Number(each, 0.3 + 0.03 * each) for name, each in spent.items()}),
+                Series({name: near(each, 0.3 + 0.03 * each) for name, each in spent.items()}),
                 lambda reply: {place["place"]: place["minutes"] for place in reply["places"]},
             )
         ],
@@ -87,12 +77,8 @@ def _visited(asked: Asked) -> Iterator[Question]:
         "How often have you driven into the dining corner?",
         "visits",
         {"where": "dining corner"},
-        [(Is(len(truth.visits["dining corner"])), _entries)],
+        [(len(truth.visits["dining corner"]), "total")],
     )
-
-
-def _x_of(nth: int, reply: Row) -> Any:
-    return reply["results"][nth]["x"]
 
 
 def _was_at(asked: Asked) -> Iterator[Question]:
@@ -104,8 +90,8 @@ def _was_at(asked: Asked) -> Iterator[Question]:
         "get_position_at",
         {"timestamp": moment, "frame_id": "map"},
         [
-            (Number(stood.x, 0.2), lambda reply: reply["x"]),
-            (Number(stood.y, 0.2), lambda reply: reply["y"]),
+            (near(stood.x, 0.2), "x"),
+            (near(stood.y, 0.2), "y"),
             (Words((stood.room,)), lambda reply: [reply["in"], reply.get("also_in")]),
         ],
     )
@@ -114,7 +100,7 @@ def _was_at(asked: Asked) -> Iterator[Question]:
         f"What was your x in the map at {', '.join(map(in_words, three))}?",
         "get_position_at",
         {"timestamps": three, "frame_id": "map"},
-        [(Number(each.x, 0.2), partial(_x_of, nth)) for nth, each in enumerate(planned[-4:-1])],
+        [(near(each.x, 0.2), f"results.{nth}.x") for nth, each in enumerate(planned[-4:-1])],
     )
 
 
@@ -126,22 +112,22 @@ def _off_the_dock(asked: Asked) -> Iterator[Question]:
         {**_OFF_DOCK, "limit": 1},
         [
             (
-                Number(asked.world.clock_at(outing.start), 3.0),
-                lambda reply: _sighting(reply)["first_seen"],
+                near(asked.world.clock_at(outing.start), 3.0),
+                "sightings.0.first_seen",
             ),
-            (Number(outing.stop - outing.start, 5.0), lambda reply: _sighting(reply)["duration_s"]),
+            (near(outing.stop - outing.start, 5.0), "sightings.0.duration_s"),
         ],
     )
     days = asked.truth.days
     for text, expected, column in (
         (
             "At what time do you usually leave the dock for the first time in a day?",
-            {day.date: Number(day.departures[0], 3.0) for day in days},
+            {day.date: near(day.departures[0], 3.0) for day in days},
             "first",
         ),
         (
             "How many times did you leave the dock on each day?",
-            {day.date: Number(len(day.departures)) for day in days},
+            {day.date: len(day.departures) for day in days},
             "count",
         ),
         (
@@ -154,7 +140,7 @@ def _off_the_dock(asked: Asked) -> Iterator[Question]:
         yield Question(text, "find_matches", arguments, [(Series(expected), bins(column))])
 
 
-def _seconds_out(asked: Asked, start: float) -> Number:
+def _seconds_out(asked: Asked, start: float) -> object:
     seconds = sum(
         b - a
         for outing in asked.world.life.outings
@@ -162,17 +148,17 @@ def _seconds_out(asked: Asked, start: float) -> Number:
         for a, b in _within(asked.world.on, outing.start, outing.stop)
     )
     # Of the split that the power cut ended a part is lost.
-    return Number(seconds, 0.03 * seconds + 0.6 * asked.world.scale.split_s)
+    return near(seconds, 0.03 * seconds + 0.6 * asked.world.scale.split_s)
 
 
-def _lowest_battery(asked: Asked, lowest: float, start: float) -> Number:
+def _lowest_battery(asked: Asked, lowest: float, start: float) -> object:
     cut, split_s = asked.world.life.power_cut[0], asked.world.scale.split_s
     within = 0.02
     if start <= cut < start + DAY:
         # Of the split that the power cut ended a part is lost.
         before, after = asked.world.battery(np.array([cut - split_s, cut])).tolist()
         within += abs(before - after)
-    return Number(lowest, within)
+    return near(lowest, within)
 
 
 def _each_day(asked: Asked) -> Iterator[Question]:
@@ -195,7 +181,7 @@ def _each_day(asked: Asked) -> Iterator[Question]:
         ),
         (
             "How many seconds of each day do you remember at all?",
-            {day.date: Number(day.recorded_s, 0.02 * day.recorded_s + split_s) for day in days},
+            {day.date: near(day.recorded_s, 0.02 * day.recorded_s + split_s) for day in days},
             "day",
             "recorded_s",
         ),
@@ -225,12 +211,12 @@ def _each_day(asked: Asked) -> Iterator[Question]:
             "oldest_first": True,
             "limit": 1,
         },
-        [(Number(began, 12.0), lambda reply: _sighting(reply)["first_seen"])],
+        [(near(began, 12.0), "sightings.0.first_seen")],
     )
 
 
-def _metres(metres: float) -> Number:
-    return Number(metres, 2.0 + 0.05 * metres)
+def _metres(metres: float) -> object:
+    return near(metres, 2.0 + 0.05 * metres)
 
 
 def _bumped(asked: Asked) -> Iterator[Question]:
@@ -240,12 +226,12 @@ def _bumped(asked: Asked) -> Iterator[Question]:
         "find_matches",
         {**_BUMPED, "limit": 1},
         [
-            (Number(bumps[-1], 2.0), lambda reply: _sighting(reply)["first_seen"]),
-            (Is(room_at(*asked.at(bumps[-1]))), lambda reply: _sighting(reply)["robot"]["in"]),
+            (near(bumps[-1], 2.0), "sightings.0.first_seen"),
+            (room_at(*asked.at(bumps[-1])), "sightings.0.robot.in"),
         ],
     )
     days = {
-        day.date: Number(sum(0 <= at - asked.day(nth) < DAY for at in bumps))
+        day.date: sum(0 <= at - asked.day(nth) < DAY for at in bumps)
         for nth, day in enumerate(asked.truth.days)
     }
     yield Question(
@@ -258,7 +244,7 @@ def _bumped(asked: Asked) -> Iterator[Question]:
         "Did anything hit your bumper while you were docked?",
         "find_matches",
         {**_BUMPED, "while": {**_OFF_DOCK, "value": True}},
-        [(Is([]), lambda reply: reply["sightings"])],
+        [([], "sightings")],
     )
 
 
@@ -273,5 +259,5 @@ def _driven(asked: Asked) -> Iterator[Question]:
         "How many metres did you drive in the hall today?",
         "trajectory_summary",
         {**asked.today, "where": HALL, "max_waypoints": 0},
-        [(_metres(hall), lambda reply: reply["distance_m"])],
+        [(_metres(hall), "distance_m")],
     )

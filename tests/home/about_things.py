@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from itertools import chain, groupby
 from typing import Any
 
-from tests.home.asking import Asked, Is, Names, Number, Question, Row, between, since, stays
+from tests.home.asking import Asked, Names, Question, Row, between, near, since, stays
 from tests.home.camera import PERSON
 from tests.home.flat import FRONT_DOOR
 from tests.home.things import NEVER_SEEN
@@ -25,14 +25,6 @@ def about_things(asked: Asked) -> Iterator[Question]:
 
 def _one(reply: Row) -> Any:
     return reply["things"][0]
-
-
-def _room(reply: Row) -> Any:
-    return _one(reply)["in"]
-
-
-def _total(reply: Row) -> Any:
-    return reply["total"]
 
 
 def _labels(reply: Row) -> list[str]:
@@ -72,14 +64,14 @@ def _how_many(asked: Asked) -> Iterator[Question]:
             {"min_score": 0.6},
         ),
     ):
-        there = [(Is(len(asked.truth.of(label))), _total)]
+        there = [(len(asked.truth.of(label)), "total")]
         yield Question(text, "find_things", {"label": label, **sure}, there)
-    yield Question("How many dogs live here?", "find_things", {"label": "dog"}, [(Is(0), _total)])
+    yield Question("How many dogs live here?", "find_things", {"label": "dog"}, [(0, "total")])
     yield Question(
         f"How often did you see an {NEVER_SEEN}?",
         "find_matches",
         {"topic": VISION.topic, "condition_type": "contains", "value": NEVER_SEEN},
-        [(Is([]), lambda reply: reply["sightings"])],
+        [([], "sightings")],
     )
 
 
@@ -90,8 +82,8 @@ def _where(asked: Asked) -> Iterator[Question]:
         ("television", "tv", "Which room has a tv?"),
         ("bottle", "bottle", "Where is the bottle now?"),
     ):
-        room = Is(_last_room(asked.thing(label)))
-        yield Question(text, "find_things", {"label": called}, [(room, _room)])
+        room = _last_room(asked.thing(label))
+        yield Question(text, "find_things", {"label": called}, [(room, "things.0.in")])
     chair = asked.truth.of("chair")[-1].known()[-1].place
     assert chair is not None
     yield Question(
@@ -99,8 +91,8 @@ def _where(asked: Asked) -> Iterator[Question]:
         "find_things",
         {"label": "chair", "where": chair.room},
         [
-            (Number(chair.x, _WITHIN_M), lambda reply: _one(reply)["place"]["x"]),
-            (Number(chair.y, _WITHIN_M), lambda reply: _one(reply)["place"]["y"]),
+            (near(chair.x, _WITHIN_M), "things.0.place.x"),
+            (near(chair.y, _WITHIN_M), "things.0.place.y"),
         ],
     )
     rooms = Names(frozenset(map(_last_room, asked.truth.of("plant"))))
@@ -151,12 +143,9 @@ def _moved(asked: Asked) -> Iterator[Question]:
             "find_things",
             {"label": label},
             [
-                (Is(_room_of(known[-1])), lambda reply: stays(_one(reply))[-1]["in"]),
+                (_room_of(known[-1]), lambda reply: stays(_one(reply))[-1]["in"]),
                 (asked.since(known), _since),
-                *[
-                    (Is(_room_of(stay)), lambda reply: stays(_one(reply))[-2]["in"])
-                    for stay in before
-                ],
+                *[(_room_of(stay), lambda reply: stays(_one(reply))[-2]["in"]) for stay in before],
             ],
         )
     mug, ball = asked.thing("mug").known(), asked.thing("ball").known()
@@ -164,13 +153,13 @@ def _moved(asked: Asked) -> Iterator[Question]:
         "In which rooms has the mug been, in order?",
         "find_things",
         {"label": "mug"},
-        [(Is(_without_repeats(map(_room_of, mug))), _rooms)],
+        [(_without_repeats(map(_room_of, mug)), _rooms)],
     )
     yield Question(
         "How often was the ball put somewhere else?",
         "find_things",
         {"label": "ball"},
-        [(Is(len(ball)), lambda reply: len(stays(_one(reply))))],
+        [(len(ball), lambda reply: len(stays(_one(reply))))],
     )
 
 
@@ -189,7 +178,7 @@ def _changes(asked: Asked) -> Iterator[Question]:
         "Is the sofa still where it was?",
         "find_things",
         {"label": "sofa"},
-        [(Is(True), lambda reply: "not_seen_where_expected" not in _one(reply)["still_there"])],
+        [(True, lambda reply: "not_seen_where_expected" not in _one(reply)["still_there"])],
     )
 
 
@@ -247,10 +236,10 @@ def _when_seen(asked: Asked) -> Iterator[Question]:
         {"label": "backpack"},
         [
             (
-                Number(backpack.sight.last_detected or 0.0, split_s),
-                lambda reply: _one(reply)["last_seen"],
+                near(backpack.sight.last_detected or 0.0, split_s),
+                "things.0.last_seen",
             ),
-            (Is(_room_of(backpack)), _room),
+            (_room_of(backpack), "things.0.in"),
         ],
     )
     first = min(
@@ -265,5 +254,5 @@ def _when_seen(asked: Asked) -> Iterator[Question]:
         "find_things",
         {"label": "phone", **asked.today},
         # With two splits for missed detections.
-        [(between(first - 1.0, first + 2 * split_s), lambda reply: _one(reply)["first_seen"])],
+        [(between(first - 1.0, first + 2 * split_s), "things.0.first_seen")],
     )

@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import pytest
 
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.maintenance.index import fill_store
@@ -28,37 +29,6 @@ Row: TypeAlias = "dict[str, Any]"
 SINCE = ("since", "from", "first_seen")
 
 
-class Expected(Protocol):
-    """What is true of a value in a reply."""
-
-    def accepts(self, given: Any) -> bool:
-        """Returns whether a value is right."""
-        ...
-
-
-@dataclass(frozen=True)
-class Is:
-    """A value that is right alone."""
-
-    value: object
-
-    def accepts(self, given: object) -> bool:
-        """Returns whether it is the same."""
-        return given == self.value
-
-
-@dataclass(frozen=True)
-class Number:
-    """A number, right within a tolerance."""
-
-    value: float
-    within: float = 0.0
-
-    def accepts(self, given: float) -> bool:
-        """Returns whether a number is near enough."""
-        return abs(given - self.value) <= self.within + 1e-9
-
-
 @dataclass(frozen=True)
 class Words:
     """A text that holds one of some words, if there are any; else none of others."""
@@ -66,7 +36,7 @@ class Words:
     any_of: tuple[str, ...]
     none_of: tuple[str, ...] = ()
 
-    def accepts(self, given: object) -> bool:
+    def __call__(self, given: object) -> bool:
         """Returns whether the text of a value is right."""
         text = json.dumps(given).casefold()
         is_any = not self.any_of or any(word in text for word in self.any_of)
@@ -80,7 +50,7 @@ class Names:
     all_of: frozenset[str]
     maybe: frozenset[str] = frozenset()
 
-    def accepts(self, given: Sequence[str]) -> bool:
+    def __call__(self, given: object) -> bool:
         """Returns whether the set is right; names may come twice, and in any order."""
         return self.all_of <= {*given} <= self.all_of | self.maybe
 
@@ -89,12 +59,12 @@ class Names:
 class Series:
     """A value for each of some names; a name that is left out counts as 0."""
 
-    values: Mapping[str, Expected]
+    values: Mapping[str, object]
 
-    def accepts(self, given: Mapping[str, Any]) -> bool:
+    def __call__(self, given: object) -> bool:
         """Returns whether every value is right, and no other name has one but 0."""
         return not any(value for name, value in given.items() if name not in self.values) and all(
-            expected.accepts(given.get(name, 0)) for name, expected in self.values.items()
+            given.get(name, 0) == expected for name, expected in self.values.items()
         )
 
 
@@ -105,12 +75,25 @@ class Question:
     text: str
     tool: str
     arguments: Mapping[str, Any]
-    checks: Sequence[tuple[Expected, Callable[[Row], Any]]]
+    checks: Sequence[tuple[object, str | Callable[[Row], Any]]]
+    """What a value must equal or satisfy, and where it is: keys with dots between, or what finds it."""
 
-    def wrong(self, reply: Row) -> list[tuple[object, Expected]]:
+    def wrong(self, reply: Row) -> list[tuple[object, object]]:
         """Returns the values of a reply that are wrong, each with what it must be."""
-        given = [(read(reply), expected) for expected, read in self.checks]
-        return [(value, expected) for value, expected in given if not expected.accepts(value)]
+        given = [(_value(reply, where), expected) for expected, where in self.checks]
+        return [(value, expected) for value, expected in given if not _is(value, expected)]
+
+
+def _is(value: object, expected: object) -> bool:
+    return bool(expected(value) if callable(expected) else value == expected)
+
+
+def _value(reply: Any, where: str | Callable[[Row], Any]) -> Any:
+    if callable(where):
+        return where(reply)
+    for key in where.split("."):
+        reply = reply[int(key) if key.isdigit() else key]
+    return reply
 
 
 @dataclass(frozen=True)
@@ -148,7 +131,7 @@ class Asked:
         (thing,) = self.truth.of(label)
         return thing
 
-    def since(self, stays: Sequence[PlaceOfThing]) -> Number:
+    def since(self, stays: Sequence[PlaceOfThing]) -> object:
         """Returns since when a thing stands at the last of its known places.
 
         It was moved after it was last seen at the place before; that it was moved is known when it
@@ -167,9 +150,14 @@ class Asked:
         return float(pose.x[0]), float(pose.y[0])
 
 
-def between(earliest: float, latest: float) -> Number:
-    """Returns a number that lies between two others."""
-    return Number((earliest + latest) / 2, (latest - earliest) / 2)
+def near(value: float, within: float) -> object:
+    """Returns what is equal to a number that is right within a tolerance."""
+    return pytest.approx(value, abs=within + 1e-9)
+
+
+def between(earliest: float, latest: float) -> object:
+    """Returns what is equal to a number that lies between two others."""
+    return near((earliest + latest) / 2, (latest - earliest) / 2)
 
 
 def in_words(moment: float) -> str:

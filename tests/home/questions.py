@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from tests.home.about_places import about_places
 from tests.home.about_things import about_things
-from tests.home.asking import Asked, Is, Number, Question, Row, Words, between, in_words
+from tests.home.asking import Asked, Question, Row, Words, between, in_words, near
 from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.truth import truth_of
 from tests.home.world import VISION, world_of
@@ -35,7 +35,7 @@ def _why(asked: Asked) -> Iterator[Question]:
             "recap",
             {"around": at},
             # What came before; an empty list is an answer.
-            [(Words(words, () if words else _OTHERS), lambda reply: reply["before"])],
+            [(Words(words, () if words else _OTHERS), "before")],
         )
 
 
@@ -74,24 +74,24 @@ def _trust(asked: Asked) -> Iterator[Question]:
             "data_time_range",
             (between(min(start, first) - 150.0, first + 10.0), lambda reply: today(reply)["start"]),
             (between(last - 10.0, until), lambda reply: today(reply)["end"]),
-            (Number(silent_s, 2.0), lambda reply: today(reply)["silent_s"]),
-            (Number(1), lambda reply: len(reply["silences"])),
+            (near(silent_s, 2.0), lambda reply: today(reply)["silent_s"]),
+            (1, lambda reply: len(reply["silences"])),
         ),
         (
             "Did your detector fall silent on any day before today?",
             "data_time_range",
-            (Is([]), lambda reply: [each for each in blind(reply) if each["start"] < midnight]),
+            ([], lambda reply: [each for each in blind(reply) if each["start"] < midnight]),
         ),
         (
             f"What is missing around {in_words(middle)}: from when to when?",
             "data_time_range",
-            (Number(gap_from, 3.0), lambda reply: outage(reply)["start"]),
-            (Number(gap_to, 3.0), lambda reply: outage(reply)["end"]),
+            (near(gap_from, 3.0), lambda reply: outage(reply)["start"]),
+            (near(gap_to, 3.0), lambda reply: outage(reply)["end"]),
         ),
         (
             "Was your clock ever set, when, and by how many seconds?",
             "data_time_range",
-            (Number(CLOCK_STEP_S, 0.2), lambda reply: step(reply)["step_s"]),
+            (near(CLOCK_STEP_S, 0.2), lambda reply: step(reply)["step_s"]),
             (
                 between(truth.clock_step - 10.0, truth.clock_step + CLOCK_STEP_S + 10.0),
                 lambda reply: step(reply)["at"],
@@ -100,12 +100,12 @@ def _trust(asked: Asked) -> Iterator[Question]:
         (
             "How many recordings were left open by a crash?",
             "memory_status",
-            (Is(1), lambda reply: reply["incomplete"]),
+            (1, "incomplete"),
         ),
         (
             "How far back do you remember?",
             "data_time_range",
-            (Number(truth.recorded[0][0], 2.0), lambda reply: reply["earliest"]),
+            (near(truth.recorded[0][0], 2.0), "earliest"),
         ),
     ):
         yield Question(text, tool, {}, checks)

@@ -53,6 +53,3 @@ def test_questions_are_answered_alike_for_a_year(
             wrong = missed(world)
             # Where one of two messages a second stays, what a detector mistakes may weigh too much.
             assert len(wrong.keys() - OF_ALL_DAYS) <= 2, (day, wrong)
-
-
-S = 10**9
