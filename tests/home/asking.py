@@ -76,7 +76,7 @@ class Question:
     tool: str
     arguments: Mapping[str, Any]
     checks: Sequence[tuple[object, str | Callable[[Row], Any]]]
-    """What a value must equal or satisfy, and where it is: keys with dots between, or what finds it."""
+    """What a value must equal or satisfy, and where it is: keys with dots, or what finds it."""
 
     def wrong(self, reply: Row) -> list[tuple[object, object]]:
         """Returns the values of a reply that are wrong, each with what it must be."""
