@@ -50,7 +50,7 @@ class Names:
     all_of: frozenset[str]
     maybe: frozenset[str] = frozenset()
 
-    def __call__(self, given: object) -> bool:
+    def __call__(self, given: Sequence[str]) -> bool:
         """Returns whether the set is right; names may come twice, and in any order."""
         return self.all_of <= {*given} <= self.all_of | self.maybe
 
@@ -61,7 +61,7 @@ class Series:
 
     values: Mapping[str, object]
 
-    def __call__(self, given: object) -> bool:
+    def __call__(self, given: Mapping[str, Any]) -> bool:
         """Returns whether every value is right, and no other name has one but 0."""
         return not any(value for name, value in given.items() if name not in self.values) and all(
             given.get(name, 0) == expected for name, expected in self.values.items()

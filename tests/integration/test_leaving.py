@@ -21,7 +21,7 @@ from ros2_memory.serving.web_app import web_app
 from ros2_memory.tools.replies import Replies, Reply
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted
-from tests.support.processes import BOUND_S, PATIENCE_S, listening
+from tests.support.processes import PATIENCE_S, listening
 from tests.unit.serving.test_dispatch import served, tool
 
 
@@ -60,11 +60,11 @@ async def asked_for(query: Endless) -> AsyncIterator[tuple[int, Dispatcher]]:
 
 
 async def set_in_time(event: threading.Event) -> None:
-    assert await asyncio.to_thread(event.wait, BOUND_S)
+    assert await asyncio.to_thread(event.wait, PATIENCE_S)
 
 
 async def none_left(dispatcher: Dispatcher) -> None:
-    async with asyncio.timeout(BOUND_S):
+    async with asyncio.timeout(PATIENCE_S):
         while dispatcher.blocking.running or dispatcher.blocking.waiting:
             await asyncio.sleep(0.001)
 
@@ -72,7 +72,7 @@ async def none_left(dispatcher: Dispatcher) -> None:
 async def began(stream: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
     """Begins an event stream; returns the path to post its messages to."""
     writer.write(head("GET", "/sse"))
-    async with asyncio.timeout(BOUND_S):
+    async with asyncio.timeout(PATIENCE_S):
         await stream.readuntil(b"session_id=")
         session = (await stream.readuntil(b"\r\n")).strip().decode()
     return f"/messages/?session_id={session}"
@@ -120,7 +120,7 @@ async def test_leaving_an_event_stream_ends_its_queries_and_those_that_wait() ->
             for body in (*opening(), *calls):
                 assert (await posted(port, body, to))[0] == 202
             await set_in_time(query.begun)
-            async with asyncio.timeout(BOUND_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while dispatcher.blocking.running + dispatcher.blocking.waiting < len(calls):
                     await asyncio.sleep(0.001)
             assert not query.ended.is_set()

@@ -22,8 +22,9 @@ from tests.support.live_recorder import (
     moment_of,
     ticks,
 )
+from tests.support.processes import until
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import Robot, publishing_robot, wait_for
+from tests.support.ros_processes import Robot, publishing_robot
 from tests.timing import each_in_time
 
 NOBODY = "65534"
@@ -129,7 +130,7 @@ def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_roo
             def errors() -> list[dict[str, Any]]:
                 return [event for event in recorder.all_events() if event["level"] == "error"]
 
-            wait_for(errors, "an error event", alive=recorder.process)
+            until(lambda: errors() or None, "an error event", alive=recorder.process)
             assert moment_of(errors()[0]) - full_at <= TOLD_WITHIN_S * NS_PER_S
             if guarded:
                 recorder.wait_for("recording_paused")
@@ -142,7 +143,7 @@ def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_roo
                 found = ticks(bag_files(recorder.bag_dir), robot.t0, HZ)
                 return any(tick.publish_time > room_at for tick in found)
 
-            wait_for(are_there, "messages after there was room", alive=recorder.process)
+            until(are_there, "messages after there was room", alive=recorder.process)
             recorder.wait_for_state(RecorderState.RECORDING)
             recorder.stop()
         finally:

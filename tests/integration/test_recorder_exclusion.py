@@ -16,8 +16,8 @@ from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import LiveRecorder, Machine
-from tests.support.processes import PATIENCE_S
-from tests.support.ros_processes import running, wait_for
+from tests.support.processes import until
+from tests.support.ros_processes import running
 
 RULES = """
 rules:
@@ -30,7 +30,7 @@ TOPICS = ("/odom", "/privacy_mode")
 def robot(site: Machine, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     truth = tmp_path / "truth"
     with running(site.env, "tests.integration.private_robot", str(truth)) as process:
-        wait_for(truth.exists, "the robot", alive=process)
+        until(truth.exists, "the robot", alive=process)
         yield process
 
 
@@ -52,7 +52,7 @@ def turned(robot: subprocess.Popen[bytes], truth: Path, sign: signal.Signals) ->
     """Sends the robot a signal; returns the number from which on it counts."""
     lines = truth.read_text().splitlines()
     robot.send_signal(sign)
-    wait_for(lambda: truth.read_text().splitlines() != lines, "a change", alive=robot)
+    until(lambda: truth.read_text().splitlines() != lines, "a change", alive=robot)
     return int(truth.read_text().splitlines()[-1])
 
 
@@ -84,7 +84,7 @@ def test_nothing_of_it_is_ever_served(
             assert not {*filter(private.__contains__, found)}, "what is private is served"
             return enough(found)
 
-        wait_for(is_enough, what, timeout_s=PATIENCE_S, alive=recorder.process)
+        until(is_enough, what, alive=recorder.process)
 
     def has_excluded_a_split() -> bool:
         """Of what this recorder began: more than the second in which the mode was not known.
@@ -102,12 +102,12 @@ def test_nothing_of_it_is_ever_served(
     served(recorder, lambda found: len(found) > 100, "two seconds")
     first = turned(robot, truth, signal.SIGUSR1)
     private = range(first, 2**60)
-    wait_for(has_excluded_a_split, "a split that is excluded", alive=recorder.process)
+    until(has_excluded_a_split, "a split that is excluded", alive=recorder.process)
     recorder.wait_for("rotated", len(recorder.events("rotated")) + 1)
     recorder.kill(with_children=True)
     assert max(found_by(index(recorder.bag_dir))) < first
     recorder = site.record("private", *given, topics=TOPICS)
-    wait_for(has_excluded_a_split, "another split that is excluded", alive=recorder.process)
+    until(has_excluded_a_split, "another split that is excluded", alive=recorder.process)
     last = turned(robot, truth, signal.SIGUSR2)
     private = range(first, last)
     served(recorder, lambda found: max(found, default=0) > last + 150, "what came after it")

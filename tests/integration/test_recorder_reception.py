@@ -30,9 +30,9 @@ from tests.support.live_recorder import (
     publishing,
     stall,
 )
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import until
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import end, wait_for
+from tests.support.ros_processes import end
 from tests.timing import each_in_time
 
 STALLS_S = (0.2, 0.3, 0.5, 1.0)
@@ -105,10 +105,9 @@ def test_a_publisher_that_comes_with_weaker_qos_is_recorded_at_once(site: Machin
         with publishing(site.env, "--first", "1000000", "/odom:100:best_effort"):
             [asked] = recorder.wait_for("asking_again")
             assert "/odom" in asked["reason"]
-            wait_for(
+            until(
                 lambda: numbers(recorder.bag_dir).get("/odom", [0])[-1] >= 1_000_000,
                 "messages of the new publisher",
-                timeout_s=PATIENCE_S,
                 alive=recorder.process,
             )
             recorder.stop()
@@ -197,7 +196,7 @@ def test_simulated_time_is_recorded_by_its_clock(
             f"recording.session_duration_s={2 * SIMULATED_SPLIT_S}",
             topics=SIMULATED,
         )
-        wait_for(
+        until(
             lambda: len(bag_files(recorder.bag_dir)) > SIMULATED_S // SIMULATED_SPLIT_S,
             "that much simulated time",
             timeout_s=SIMULATED_S / SPEED + 120,

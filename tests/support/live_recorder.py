@@ -34,7 +34,7 @@ from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import RealRecorder, env_without_ros
 from tests.support.robot_run import ask
-from tests.support.ros_processes import ros_environment, running, wait_for
+from tests.support.ros_processes import ros_environment, running
 from tests.support.served import Served, serving
 
 RECORDED_TOPICS = (
@@ -118,7 +118,7 @@ class LiveRecorder:
             running = self.children()
             return bool(running) and running[-1].recording in self.subscribed_all()
 
-        wait_for(all_there, "all subscriptions", alive=self.process)
+        until(all_there, "all subscriptions", alive=self.process)
 
     def subscribed_all(self) -> dict[str, int]:
         """The recordings that subscribed to all of `RECORDED_TOPICS`, and when they had (ns)."""
@@ -164,7 +164,7 @@ class LiveRecorder:
             with suppress(ProcessLookupError):
                 os.kill(child.pid, signal.SIGKILL)
         self.process.wait(timeout=PATIENCE_S)
-        wait_for(lambda: not any(_is_running(child.pid) for child in children), "their end")
+        until(lambda: not any(_is_running(child.pid) for child in children), "their end")
         return Killed(at, time.time_ns(), tuple(child.recording for child in children))
 
     @property
@@ -342,7 +342,7 @@ def await_answerable(served: Served, moment: int) -> None:
         latest = json.loads(served.get("/health")[1]).get("latest")
         return latest is not None and latest * NS_PER_S >= moment
 
-    wait_for(reaches, "bags that reach so far")
+    until(reaches, "bags that reach so far")
 
 
 def await_moment(moment: int) -> None:

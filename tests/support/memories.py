@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -139,50 +139,24 @@ def asked(memory: Memory, name: str, **given: object) -> Any:
 
 def assert_same_counts(reply: Any, expected: Any, *, of_means: float = 1e-3) -> None:
     """Both replies are the same; means and scores are, to what columns round numbers to."""
-    assert _without_scores(_without_means(reply)) == _without_scores(_without_means(expected))
-    for row, other in zip(_means(reply), _means(expected), strict=True):
-        assert row == pytest.approx(other, abs=of_means)
-    assert [*_scores(reply)] == pytest.approx([*_scores(expected)], abs=2e-4)
+    assert reply == _rounded(expected, of_means)
 
 
-def _without_scores(reply: Any) -> Any:
+def _rounded(reply: Any, of_means: float) -> Any:
+    """What is equal to a reply with such means and scores."""
     if isinstance(reply, list):
-        return [_without_scores(each) for each in reply]
-    if isinstance(reply, dict):
-        scored = isinstance(reply.get("score"), float)
-        return {
-            key: None if scored and key == "score" else _without_scores(each)
-            for key, each in reply.items()
-        }
-    return reply
-
-
-def _scores(reply: Any) -> Iterator[float]:
-    if isinstance(reply, list | dict):
-        for each in reply.values() if isinstance(reply, dict) else reply:
-            yield from _scores(each)
-    if isinstance(reply, dict) and isinstance(reply.get("score"), float):
-        yield reply["score"]
-
-
-def _of_means(reply: Any) -> list[int]:
-    columns = reply.get("columns", ()) if isinstance(reply, dict) else ()
-    return [nth for nth, name in enumerate(columns) if name.endswith(".mean")]
-
-
-def _means(reply: Any) -> list[list[Any]]:
-    # The first column of a row is its name, which the row of all has not.
-    rows = [*reply["rows"], [None, *reply["all"]]] if _of_means(reply) else []
-    return [[row[nth] for nth in _of_means(reply)] for row in rows]
-
-
-def _without_means(reply: Any) -> Any:
-    left_out = _of_means(reply)
-    if not left_out:
+        return [_rounded(each, of_means) for each in reply]
+    if not isinstance(reply, dict):
         return reply
-    rows = [[each for nth, each in enumerate(row) if nth not in left_out] for row in reply["rows"]]
-    whole = [each for nth, each in enumerate(reply["all"], 1) if nth not in left_out]
-    return {**reply, "rows": rows, "all": whole}
+    found = {key: _rounded(each, of_means) for key, each in reply.items()}
+    if isinstance(reply.get("score"), float):
+        found["score"] = pytest.approx(reply["score"], abs=2e-4)
+    for nth, name in enumerate(reply.get("columns", ())):
+        if name.endswith(".mean"):
+            # The first column of a row is its name, which the row of all has not.
+            for row, at in (*((row, nth) for row in found["rows"]), (found["all"], nth - 1)):
+                row[at] = pytest.approx(row[at], abs=of_means)
+    return found
 
 
 def replied(

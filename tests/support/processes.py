@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -29,30 +30,34 @@ LONGEST_PAUSE_S = 0.05
 """Between two looks at a condition that is waited for."""
 
 
-def until(what: Callable[[], T | None], name: str = "", *, timeout_s: float = PATIENCE_S) -> T:
+def until(
+    what: Callable[[], T | None],
+    name: str = "",
+    *,
+    timeout_s: float = PATIENCE_S,
+    alive: subprocess.Popen[bytes] | None = None,
+) -> T:
     """The first result of `what` that is neither None nor False.
 
     Args:
         what: is asked again and again.
         name: what the error calls it.
         timeout_s: how long it may take.
+        alive: what must run meanwhile.
 
     Raises:
-        AssertionError: there was none within the timeout.
+        AssertionError: there was none within the timeout, or before that ended.
     """
     give_up, pause_s = time.monotonic() + timeout_s, 0.01
     while True:
         found = what()
         if found is not None and found is not False:
             return found
+        assert alive is None or alive.poll() is None, f"it ended before {name}"
         assert time.monotonic() < give_up, f"waited {timeout_s:g} s in vain for {name or what}"
         time.sleep(pause_s)
         # Asking takes processor time, often of the very program that is waited for.
         pause_s = min(1.2 * pause_s, LONGEST_PAUSE_S)
-
-
-BOUND_S = PATIENCE_S
-"""No test waits longer for what it expects."""
 
 
 @contextmanager
@@ -95,7 +100,7 @@ async def listening(
     server = uvicorn.Server(config)
     with socket.create_server(("127.0.0.1", 0)) as bound:
         task = asyncio.create_task(server._serve([bound]))
-        async with asyncio.timeout(BOUND_S):
+        async with asyncio.timeout(PATIENCE_S):
             while not server.started:
                 await asyncio.sleep(0.001)
         try:

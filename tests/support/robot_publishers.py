@@ -54,10 +54,9 @@ from tests.support.bags import (
     transform,
     typestore,
 )
+from tests.support.closed_form import RADIUS, TURN_RATE, position
 from tests.support.ros_types import publisher
 
-RADIUS = 2.0  # m
-TURN_RATE = 0.25  # rad/s
 SEEN = {"table": (0.0, math.inf), "cup": (5.0, 30.0), "scissors": (12.0, 18.0)}
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
@@ -84,8 +83,7 @@ _SENSORS = {"laser": (0.10, 0.0, 0.20), "camera": (0.15, 0.0, 0.30)}
 
 def pose(t: float) -> tuple[float, float, float]:
     """x and y (m) and yaw (rad, not wrapped) in odom, t seconds after T0."""
-    angle = TURN_RATE * t
-    return RADIUS * math.sin(angle), RADIUS * (1.0 - math.cos(angle)), angle
+    return *position(t), TURN_RATE * t
 
 
 def seen(t: float) -> list[str]:

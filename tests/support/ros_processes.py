@@ -10,7 +10,7 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -64,7 +64,7 @@ class Robot:
     @property
     def t0(self) -> int:
         """T0 in ns; waits until the robot drives."""
-        wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
+        until(self.truth_file.is_file, "the robot's start", alive=self.process)
         return int(self._truth()["t0_ns"])
 
     @property
@@ -79,7 +79,7 @@ class Robot:
 
     def stop(self) -> dict[str, int]:
         """Ends the drive, once it has begun; returns how many messages were published by topic."""
-        wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
+        until(self.truth_file.is_file, "the robot's start", alive=self.process)
         self.process.send_signal(signal.SIGINT)
         code = self.process.wait(timeout=PATIENCE_S)
         assert code == 0, f"the robot's publishers ended with {code}"
@@ -127,24 +127,6 @@ def running(
         yield process
     finally:
         end(process)
-
-
-def wait_for(
-    condition: Callable[[], object],
-    what: str,
-    *,
-    timeout_s: float = PATIENCE_S,
-    alive: subprocess.Popen[bytes] | None = None,
-) -> None:
-    """Returns once the condition holds; fails where it does not in time, or `alive` died."""
-
-    def holds() -> bool:
-        if condition():
-            return True
-        assert alive is None or alive.poll() is None, f"it ended before {what}"
-        return False
-
-    until(holds, what, timeout_s=timeout_s)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

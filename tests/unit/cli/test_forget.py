@@ -280,20 +280,6 @@ def test_where_metadata_cannot_be_corrected_it_says_so_and_what_to_do(
     assert metadata.read_text() == before
 
 
-@pytest.mark.parametrize("deployment", ["query_only", "replay"])
-def test_bags_that_others_record_are_refused(
-    bag_dir: Path, forget: Forget, deployment: str
-) -> None:
-    assert "recorder=none" in forget(2, 0, 100, f"--yes deployment={deployment}").err
-    assert len(bags(bag_dir)) == 4
-
-
-def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
-    exits(2, "forget --yes")
-    assert "--last" in exits(2, "forget --yes --start 0").err
-    assert len(bags(bag_dir)) == 4
-
-
 def test_without_a_list_nothing_goes_before_it_is_adopted(
     bag_dir: Path, exits: Program, forget: Forget
 ) -> None:

@@ -20,7 +20,7 @@ from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
 from ros2_memory.serving.connection_limits import MAX_BODY_BYTES, RequestLimits
 from ros2_memory.serving.dispatch import MAX_DEPTH, excess_in_arguments
-from tests.support.processes import BOUND_S, listening
+from tests.support.processes import PATIENCE_S, listening
 from tests.unit.serving.test_web_app import (
     MCP_HEADERS,
     app,
@@ -79,20 +79,20 @@ class Served:
         for part in sent:
             writer.write(part)
             await writer.drain()
-        async with asyncio.timeout(BOUND_S):
+        async with asyncio.timeout(PATIENCE_S):
             shown = await reader.read()
         writer.close()
         return shown
 
     async def gone(self) -> None:
-        async with asyncio.timeout(BOUND_S):
+        async with asyncio.timeout(PATIENCE_S):
             while self.server.server_state.connections:
                 await asyncio.sleep(0.001)
 
 
 async def answered(reader: asyncio.StreamReader) -> None:
     """Reads a whole reply of the application."""
-    async with asyncio.timeout(BOUND_S):
+    async with asyncio.timeout(PATIENCE_S):
         assert b" 200 " in await reader.readuntil(b"ok")
 
 
@@ -149,7 +149,7 @@ async def test_a_reply_that_is_not_read_ends_the_connection_and_the_call() -> No
         # Not asyncio's: that one reads by itself.
         with socket.create_connection(("127.0.0.1", served.port)) as client:
             client.sendall(b"GET /flood HTTP/1.1\r\nhost: a\r\n\r\n")
-            async with asyncio.timeout(BOUND_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while not served.app.under_way:
                     await asyncio.sleep(0.001)
                 await served.gone()
@@ -208,9 +208,9 @@ async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
             strangers = []
             for _ in range(6):
                 place = ("127.0.0.1", served.port)
-                strangers.append(stack.enter_context(socket.create_connection(place, BOUND_S)))
+                strangers.append(stack.enter_context(socket.create_connection(place, PATIENCE_S)))
                 strangers[-1].sendall(b"G")
-                async with asyncio.timeout(BOUND_S):
+                async with asyncio.timeout(PATIENCE_S):
                     while len(served.server.server_state.connections) < min(len(strangers), 3) + 1:
                         await asyncio.sleep(0.001)
             for each in strangers[:3]:
@@ -293,7 +293,7 @@ async def test_peers_that_are_gone_fill_no_log(
 async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
     async with serving() as served:
         _, writer = await served.connect()
-        async with asyncio.timeout(BOUND_S):
+        async with asyncio.timeout(PATIENCE_S):
             while not served.server.server_state.connections:
                 await asyncio.sleep(0.001)
         [connection] = served.server.server_state.connections
