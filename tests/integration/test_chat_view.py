@@ -1,6 +1,7 @@
 """The view of MCP Apps in real Chromium, in a host made from the extension's specification."""
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
@@ -13,12 +14,35 @@ from mcp import Client
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
+from ros2_memory.core.timebase import ns_from_unix
+from ros2_memory.demo.messages import MessageSchedule
+from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer
 from tests.integration.browser import Browser, needs_chromium
 from tests.integration.test_page import ATTACK, painted, write_history
-from tests.support.demo_bags import ASKED_AT_S, recorded
+from tests.support.clocks import FixedClock
 from tests.support.processes import http_server
 from tests.support.robot_run import T0_S
+
+STARTED_S = 1_784_023_200
+"""When the robot started, in Unix seconds: it was on its dock."""
+HEARD_AFTER_S = 17
+"""Seconds after its start from which on it is recorded."""
+ASKED_AT_S = STARTED_S + 240.5
+
+
+@contextmanager
+def recorded(folder: Path) -> Iterator[None]:
+    """Three laps of which the last split is open: the robot stands on its dock again."""
+    start = ns_from_unix(STARTED_S)
+    now = ns_from_unix(ASKED_AT_S)
+    timeline = MessageSchedule(start, start + ns_from_unix(HEARD_AFTER_S))
+    recorder = DemoRecorder(folder / "flat", timeline, split_duration_s=10.0, clock=FixedClock(now))
+    for path in folder.rglob("*.mcap"):
+        os.utime(path, ns=(now, now))  # however long it took to write them
+    yield
+    recorder.stop()
+
 
 POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "

@@ -5,13 +5,11 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import httpx2
 import pytest
 
-from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from tests.integration.browser import ENTER, RIGHT, TAB, Browser, needs_chromium
 from tests.support.bags import boolean, detections, odom, text, write_mcap
@@ -493,9 +491,8 @@ def test_it_shows_what_the_recorder_says_of_itself(chromium: Browser, scratch: P
     write_mcap(bag_dir / "rec" / "rec_0.mcap", [odom(T0, 0.0, 0.0)])
     missing = tuple(f"/gone_{n:02}" for n in range(25))
     # One that comes each hour is live for as long as the test may take.
-    beat = replace(heartbeat(time.time_ns()), interval_s=3600.0, restarts=2, silent=("/scan",))
-    beat = replace(beat, missing=missing)
-    write_heartbeat(bag_dir, beat)
+    said = {"interval_s": 3600.0, "restarts": 2, "silent": ("/scan",), "missing": missing}
+    heartbeat(bag_dir, time.time_ns(), **said)
     with serving(bag_dir, scratch / "log_robot", "storage=mcap") as server:
         chromium.open(server.url("/"))
         chromium.awaits(LOOKED)

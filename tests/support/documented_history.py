@@ -9,18 +9,12 @@ a drive of one minute, from 08:00:00 UTC on 20 November 2026, in six splits of 1
 import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import anyio
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
-from ros2_memory.bag_dir.heartbeat import (
-    HEARTBEAT_FILE,
-    Heartbeat,
-    RecorderState,
-    write_heartbeat,
-)
+from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_saved_moment
 from ros2_memory.bootstrap import build_server, query_settings_of
@@ -28,6 +22,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.heartbeats import beat
 from tests.support.housekeepers import recorder_at_work
 from tests.support.memories import memory_of
 
@@ -133,14 +128,6 @@ def write_history(bag_dir: Path) -> Path:
     return bag_dir
 
 
-@contextmanager
-def recorder_beside(bag_dir: Path, clock: SettableClock) -> Iterator[None]:
-    """A recorder's heartbeat, and what it does when a moment is to be kept."""
-    write_heartbeat(bag_dir, heartbeat(clock.at))
-    with recorder_at_work(bag_dir, clock):
-        yield
-
-
 def replies(bag_dir: Path) -> dict[str, str]:
     """The replies to `CALLS` and `MISTAKES`, asked `NOW`; the moment is kept before the status."""
     clock = SettableClock(NOW)
@@ -148,7 +135,8 @@ def replies(bag_dir: Path) -> dict[str, str]:
     memory = memory_of(bag_dir, clock=clock, limits=query_settings_of(settings))
     server = build_server(settings, memory)
     told = {}
-    with recorder_beside(bag_dir, clock):
+    heartbeat(bag_dir, NOW)
+    with recorder_at_work(bag_dir, clock):
         for name in sorted(CALLS, key=lambda name: name == "memory_status"):
             told[name] = anyio.run(server.dispatcher.answer, name, CALLS[name]).text
         for name, (tool, given) in MISTAKES.items():
@@ -159,7 +147,7 @@ def replies(bag_dir: Path) -> dict[str, str]:
 
 def shown_files(bag_dir: Path) -> dict[str, str]:
     """The recorder's own files of that history, by name."""
-    write_heartbeat(bag_dir, heartbeat(NOW))
+    heartbeat(bag_dir, NOW)
     cut = (START_S + 60) * NS_PER_S
     overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
     write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
@@ -170,17 +158,15 @@ def shown_files(bag_dir: Path) -> dict[str, str]:
     return {name: (bag_dir / name).read_text() for name in names}
 
 
-def heartbeat(now: int) -> Heartbeat:
-    """What the recorder says at some time of that history."""
-    return Heartbeat(
+def heartbeat(bag_dir: Path, now: int, **more: object) -> None:
+    """Writes what the recorder says at some time of that history."""
+    beat(
+        bag_dir,
+        now,
         pid=4711,
-        updated=now,
-        state=RecorderState.RECORDING,
         recordings=(RECORDING,),
         since=START_S * NS_PER_S,
         bytes_written=1_000_000,
         subscribed=("/odom", "/tf", "/tf_static"),
-        silent=(),
-        last_error=None,
-        interval_s=2.0,
+        **more,
     )

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -121,27 +120,6 @@ def lake_rows(folder: Path, table: str) -> list[dict[str, Any]]:
 def lake_column(folder: Path, table: str, column: str) -> list[object]:
     """The values of a column of the lake, sorted by their text."""
     return sorted((row[column] for row in lake_rows(folder, table)), key=str)
-
-
-def ship_and_ask(where: LakeLocation, folder: Path) -> None:
-    """Ships two bags of a robot, each by two processes in turn, and asks the lake for them.
-
-    The second process finds nothing new.
-    """
-    for number in (0, 1):
-        write_bag(folder, number)
-        for shipped in (1, 0):
-            with where.writable() as tables:
-                robots = [robot_bags("hall", folder)]
-                assert Shipper(tables, robots, FixedClock(LATER)).run().bags == shipped
-    with where.opened() as catalog:
-        lake = Lake(catalog, where.translated)
-        assert [*lake.days("bags")] == ["hall"]
-        files = chain.from_iterable(lake.days("sightings")["hall"].values())
-        found = lake.rows("sightings", files, ("bag_id", "label")).to_pylist()
-        assert lake.query("SELECT count(*) FROM sightings").rows == [[2]]
-    assert [row["label"] for row in found] == ["cup", "cup"]
-    assert len({row["bag_id"] for row in found}) == 2
 
 
 def lake_in(folder: Path) -> SqlCatalog:

@@ -41,7 +41,7 @@ def ros_environment(folder: Path, *, real: RealRecorder) -> Iterator[dict[str, s
         try:
             yield {
                 **real.env,
-                # That of `tests/support/ros_types.py`.
+                # That of the type support in `tests/support/robot_publishers.py`.
                 "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
                 "ROS2_LIVE_SETUP": str(real.setup),
                 "ROS2_LIVE_PYTHON": real.python,

@@ -1,19 +1,28 @@
 """Each bag comes into the lake once, whatever happens while it is shipped."""
 
 import errno
+import json
 import os
 import re
 import shutil
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
+from http.server import BaseHTTPRequestHandler
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 from urllib.request import Request, urlopen
 
 import pytest
+from pyiceberg.catalog.rest import CreateTableRequest
 from pyiceberg.catalog.sql import SqlCatalog
+from pyiceberg.exceptions import CommitFailedException, NoSuchTableError
 from pyiceberg.manifest import ManifestEntry
+from pyiceberg.table import CommitTableRequest
 from pyiceberg.table.update.snapshot import _OverwriteFiles
 
 from ros2_memory.bag_dir.layout import SHIPPED_FILE
@@ -24,6 +33,7 @@ from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake import shipper as shipper_module
+from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.tables import TABLES
@@ -41,13 +51,11 @@ from tests.support.lakes import (
     location,
     robot_bags,
     ship,
-    ship_and_ask,
     ship_from,
     shipping,
     write_bag,
 )
-from tests.support.processes import until
-from tests.support.rest_catalogue import rest_catalogue
+from tests.support.processes import http_server, until
 
 ROBOTS = ("hall", "kitchen")
 BAGS = 3
@@ -421,3 +429,108 @@ def test_bags_are_shipped_once_into_a_bucket_asked_and_forgotten(tmp_path: Path)
         assert not any(secret.encode() in each.read_bytes() for each in kept)
     finally:
         server.stop()
+
+
+class _Requests(BaseHTTPRequestHandler):
+    """Answers requests below `/v1`."""
+
+    def __init__(self, catalog: SqlCatalog, lock: threading.Lock, *given: object) -> None:
+        self._catalog, self._lock = catalog, lock
+        super().__init__(*given)  # type: ignore[arg-type]  # as the server calls it
+
+    def log_message(self, *_: object) -> None:
+        """Logs nothing."""
+
+    def do_GET(self) -> None:
+        status = 404
+        content: object = {"error": {"message": "none", "type": "NoSuch", "code": status}}
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        try:
+            with self._lock:
+                status, content = self._answer(body) or (status, content)
+        except NoSuchTableError:
+            pass
+        except CommitFailedException as error:
+            status = 409
+            content = {"error": {"message": str(error), "type": "Conflict", "code": status}}
+        data = json.dumps(content).encode()
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def do_POST(self) -> None:
+        self.do_GET()
+
+    def _answer(self, body: bytes) -> tuple[int, object] | None:
+        catalog, parts = self._catalog, self.path.partition("?")[0].split("/")[2:]
+        found: tuple[int, object] | None = None
+        match self.command, *parts:
+            case "GET", "config":
+                found = 200, {"defaults": {}, "overrides": {}}
+            case "GET", "namespaces", name if (name,) in catalog.list_namespaces():
+                found = 200, {"namespace": [name], "properties": {}}
+            case "POST", "namespaces":
+                asked = json.loads(body)["namespace"]
+                is_new = tuple(asked) not in catalog.list_namespaces()
+                catalog.create_namespace_if_not_exists(tuple(asked))
+                found = 200 if is_new else 409, {"namespace": asked}
+            case "POST", "namespaces", name, "tables":
+                new = CreateTableRequest.model_validate({"location": None, **json.loads(body)})
+                assert new.partition_spec is not None
+                assert new.write_order is not None
+                catalog.create_table(
+                    f"{name}.{new.name}",
+                    new.table_schema,
+                    partition_spec=new.partition_spec,
+                    sort_order=new.write_order,
+                    properties=new.properties,
+                )
+                found = self._table(f"{name}.{new.name}")
+            case "POST", "namespaces", name, "tables", known:
+                commit = CommitTableRequest.model_validate_json(body)
+                table = catalog.load_table(f"{name}.{known}")
+                catalog.commit_table(table, commit.requirements, commit.updates)
+                found = self._table(f"{name}.{known}")
+            case "GET", "namespaces", name, "tables", known:
+                found = self._table(f"{name}.{known}")
+        return found
+
+    def _table(self, name: str) -> tuple[int, object]:
+        table = self._catalog.load_table(name)
+        metadata = json.loads(table.metadata.model_dump_json())
+        return 200, {"metadata-location": table.metadata_location, "metadata": metadata}
+
+
+@contextmanager
+def rest_catalogue(folder: Path) -> Iterator[str]:
+    """Serves a catalogue whose tables lie below a folder; yields its address."""
+    folder.mkdir(parents=True, exist_ok=True)
+    catalog = SqlCatalog("rest", uri=f"sqlite:///{folder}/rest.sqlite", warehouse=folder.as_uri())
+    answers = partial(_Requests, catalog, threading.Lock())
+    try:
+        with http_server(answers) as address:
+            yield address
+    finally:
+        catalog.close()
+
+
+def ship_and_ask(where: LakeLocation, folder: Path) -> None:
+    """Ships two bags of a robot, each by two processes in turn, and asks the lake for them.
+
+    The second process finds nothing new.
+    """
+    for number in (0, 1):
+        write_bag(folder, number)
+        for shipped in (1, 0):
+            with where.writable() as tables:
+                robots = [robot_bags("hall", folder)]
+                assert Shipper(tables, robots, FixedClock(LATER)).run().bags == shipped
+    with where.opened() as catalog:
+        lake = Lake(catalog, where.translated)
+        assert [*lake.days("bags")] == ["hall"]
+        files = chain.from_iterable(lake.days("sightings")["hall"].values())
+        found = lake.rows("sightings", files, ("bag_id", "label")).to_pylist()
+        assert lake.query("SELECT count(*) FROM sightings").rows == [[2]]
+    assert [row["label"] for row in found] == ["cup", "cup"]
+    assert len({row["bag_id"] for row in found}) == 2
