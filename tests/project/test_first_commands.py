@@ -82,10 +82,14 @@ def ran(script: str, clone: Path, programs: Path) -> subprocess.CompletedProcess
 def test_readmes_first_line_works_where_the_distribution_manages_python(
     clone: Path, tmp_path: Path
 ) -> None:
-    assert FIRST
     programs = debian_like(tmp_path / "debian")
     refused = ran("python3 -m pip install .", clone, programs)
     assert "externally-managed-environment" in refused.stderr
+    require_the_demo(clone, programs)
+
+
+def require_the_demo(clone: Path, programs: Path) -> None:
+    assert FIRST
     done = ran(f"{FIRST[0]} --once --port 0", clone, programs)
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^(\d+) of \1 answers are right", done.stdout, re.MULTILINE)
@@ -109,11 +113,7 @@ def test_readmes_first_line_works_with_the_python_of_ubuntu_24_04(
     clone: Path, tmp_path: Path
 ) -> None:
     """Or with a newer one: some of what 3.11 takes, these do not."""
-    assert FIRST
-    programs = python_of((12, 13, 14), tmp_path / "newer")
-    done = ran(f"{FIRST[0]} --once --port 0", clone, programs)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"^(\d+) of \1 answers are right", done.stdout, re.MULTILINE)
+    require_the_demo(clone, python_of((12, 13, 14), tmp_path / "newer"))
 
 
 def test_an_older_python_is_refused_by_name_and_the_how_to_gets_a_newer_one(

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -68,17 +67,6 @@ def imported(program: str, env: dict[str, str]) -> list[list[str]]:
     return told
 
 
-def of_commands(commands: Sequence[str], env: dict[str, str]) -> list[list[str]]:
-    """Modules that are there after each of these commands, run one after another."""
-    program = (
-        "from ros2_memory import cli\n"
-        f"for line in {[*commands]}:\n"
-        "    assert cli.main(line.split()) == 0, line\n"
-        "    seen()\n"
-    )
-    return imported(program, env)
-
-
 def test_a_command_imports_what_it_needs(env: dict[str, str]) -> None:
     """Each is run after those that need less, in one interpreter: it need not start for each."""
     nearly_all = SERVING | DELETING | RECORDING
@@ -92,7 +80,13 @@ def test_a_command_imports_what_it_needs(env: dict[str, str]) -> None:
         "ask get_position_seconds_ago seconds_ago=0": nearly_all | FLEET,
         "forget --last 100 --dry-run": SERVING | RECORDING,
     }
-    for (line, absent), there in zip(without.items(), of_commands([*without], env), strict=True):
+    program = (
+        "from ros2_memory import cli\n"
+        f"for line in {[*without]}:\n"
+        "    assert cli.main(line.split()) == 0, line\n"
+        "    seen()\n"
+    )
+    for (line, absent), there in zip(without.items(), imported(program, env), strict=True):
         assert absent.isdisjoint(there), line
 
 

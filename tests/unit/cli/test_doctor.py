@@ -113,11 +113,6 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
     assert f"MEMORY_CONFIG_DIR={beside}" in output
 
 
-def test_a_recording_that_is_not_there_is_a_finding(robot: Path, examined: Examined) -> None:
-    [found] = examined(2, "data.recording=typo")["config"]
-    assert "no bag is named typo (data.recording)" in found["seen"]
-
-
 def test_data_from_the_future_means_that_the_clock_is_wrong(
     robot: Path, examined: Examined
 ) -> None:
@@ -200,6 +195,9 @@ class Fault(NamedTuple):
             setting="recorder.setup_files=[/opt/ros/none/setup.bash]",
         ),
         Fault(2, ["config: server.prot: .*-> correct the key"], setting="server.prot=1"),
+        Fault(
+            2, [r"config: .*no bag is named typo \(data.recording\)"], setting="data.recording=typo"
+        ),
         Fault(
             1,
             ["topics: /mic in retention.topics is no topic that is recorded -> compare"],

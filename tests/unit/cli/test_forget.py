@@ -256,26 +256,19 @@ def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
     assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in shown
 
 
-@pytest.fixture
-def metadata(bag_dir: Path) -> Path:
-    """That of the first recording."""
-    return described(bag_dir / "rec_0")
-
-
-def test_metadata_lists_what_is_left(metadata: Path, forget: Forget) -> None:
+def test_metadata_lists_what_is_left_or_it_says_why_not_and_what_to_do(
+    bag_dir: Path, forget: Forget
+) -> None:
+    metadata = described(bag_dir / "rec_0")
     shown = forget(0, 0, 15).out
     info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
     assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
     assert "rec_0/metadata.yaml describes what is left" in shown
-
-
-def test_where_metadata_cannot_be_corrected_it_says_so_and_what_to_do(
-    metadata: Path, forget: Forget
-) -> None:
+    metadata = described(bag_dir / "rec_1")
     metadata.write_text(metadata.read_text().replace("version: ", "version: -"))
     before = metadata.read_text()
-    output = forget(0, 0, 15).out
-    assert "rec_0/metadata.yaml still describes what was deleted (it is of version" in output
+    output = forget(0, 40, 55).out
+    assert "rec_1/metadata.yaml still describes what was deleted (it is of version" in output
     assert f"ros2 bag reindex {metadata.parent}" in output
     assert metadata.read_text() == before
 
