@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import anyio
 
@@ -158,7 +159,7 @@ def shown_files(bag_dir: Path) -> dict[str, str]:
     return {name: (bag_dir / name).read_text() for name in names}
 
 
-def heartbeat(bag_dir: Path, now: int, **more: object) -> None:
+def heartbeat(bag_dir: Path, now: int, **more: Any) -> None:
     """Writes what the recorder says at some time of that history."""
     beat(
         bag_dir,
