@@ -10,10 +10,11 @@ from tests.fuzz.mutant import Mutant, mutant_file, mutant_of
 from tests.fuzz.records import (
     MAGIC,
     RECORD,
-    as_it_was,
     inside,
+    numbers_of,
     pieces,
     rebuilt,
+    with_summary_or_without,
     with_summary_sealed,
     without_summary,
 )
@@ -36,7 +37,7 @@ def flip_bits_beneath_checksums(rng: Random, good: Good) -> Mutant:
     """Bits of the content, with the checksums of what holds it made right again."""
     plain = bytearray(good.plain)
     records = pieces(good.plain)
-    chunks = [at for at, each in enumerate(records) if each.opcode == Opcode.CHUNK]
+    chunks = numbers_of(records, Opcode.CHUNK)
     if not chunks or rng.random() < 0.5:
         begin = max(0, len(plain) - 2000) if rng.random() < 0.5 else 0
         for _ in range(rng.choice((1, 3, 10))):
@@ -61,7 +62,7 @@ def cut(rng: Random, good: Good) -> Mutant:
 def cut_inside_a_chunk(rng: Random, good: Good) -> Mutant:
     """An end at or inside a record of a chunk, the chunk stored plain."""
     records = pieces(good.plain)
-    chunks = [at for at, each in enumerate(records) if each.opcode == Opcode.CHUNK]
+    chunks = numbers_of(records, Opcode.CHUNK)
     if not chunks:
         return cut(rng, good)
     at = rng.choice(chunks)
@@ -111,7 +112,7 @@ def wrong_length(rng: Random, good: Good) -> Mutant:
 def wrong_length_inside(rng: Random, good: Good) -> Mutant:
     """A record in a chunk, or a text in a record, that states another length than it has."""
     records = pieces(good.plain)
-    chunks = [at for at, each in enumerate(records) if each.opcode == Opcode.CHUNK]
+    chunks = numbers_of(records, Opcode.CHUNK)
     if not chunks:
         return wrong_length(rng, good)
     at = rng.choice(chunks)
@@ -126,9 +127,7 @@ def wrong_length_inside(rng: Random, good: Good) -> Mutant:
         where = each.start + RECORD.size + rng.randrange(0, len(each.body) - 4)
         struct.pack_into("<I", content, where, _other_length(rng, 40, 1 << 20) & 0xFFFFFFFF)
     records[at] = rebuilt(records[at], bytes(content))
-    if rng.random() < 0.5:
-        return mutant_of(good, without_summary(records))
-    return mutant_of(good, as_it_was(good.plain, records))
+    return mutant_of(good, with_summary_or_without(rng, good.plain, records))
 
 
 def absurd_number(rng: Random, good: Good) -> Mutant:

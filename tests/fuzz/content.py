@@ -18,14 +18,15 @@ from tests.fuzz.good import BASE_S, Good, mcaps, run_of, sqlites
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import (
     Piece,
-    as_it_was,
     channel,
     chunk_of,
     header,
     inside,
     message,
+    numbers_of,
     pieces,
     schema,
+    with_summary_or_without,
     without_summary,
 )
 from tests.support.bags import Msg, definition, write_db3, write_mcap
@@ -42,15 +43,13 @@ def splice(rng: Random, good: Good) -> Mutant:
         return splice_pages(rng, good)
     records = pieces(good.plain)
     other = pieces(rng.choice(mcaps()).plain)
-    mine = [at for at, each in enumerate(records) if each.opcode in {Opcode.CHUNK, Opcode.MESSAGE}]
+    mine = numbers_of(records, Opcode.CHUNK, Opcode.MESSAGE)
     if not mine:
         return mutant_of(good, without_summary(records + other))
     for _ in range(rng.choice((1, 1, 3))):
         _splice_one(rng, records, rng.choice(mine), other)
         mine = [at for at in mine if at < len(records)]
-    if rng.random() < 0.5:
-        return mutant_of(good, without_summary(records))
-    return mutant_of(good, as_it_was(good.plain, records))
+    return mutant_of(good, with_summary_or_without(rng, good.plain, records))
 
 
 def _splice_one(rng: Random, records: list[Piece], at: int, other: list[Piece]) -> None:
@@ -115,9 +114,7 @@ def swap_schema_numbers(rng: Random, good: Good) -> Mutant:
     records = [_renumbered(rng, each) for each in records]
     if not records:
         return swap_schemas(rng, good)
-    if rng.random() < 0.5:
-        return mutant_of(good, without_summary(records))
-    return mutant_of(good, as_it_was(good.plain, records))
+    return mutant_of(good, with_summary_or_without(rng, good.plain, records))
 
 
 def _renumbered(rng: Random, each: Piece) -> Piece:

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 
 from tests.fuzz.good import Good
 from tests.fuzz.mutant import Mutant, mutant_of
-from tests.fuzz.records import Piece, as_it_was, pieces, with_summary_sealed
+from tests.fuzz.records import Piece, as_it_was, numbers_of, pieces, with_summary_sealed
 
 _PAIR = 16
 _INDEX_PAGES = (2, 10)
@@ -24,7 +24,7 @@ _INDEX_PAGES = (2, 10)
 def flip_message_index(rng: Random, good: Good) -> Mutant:
     """One bit, or some, of the times and places in message indexes."""
     records = pieces(good.plain)
-    at = [n for n, each in enumerate(records) if each.opcode == Opcode.MESSAGE_INDEX]
+    at = numbers_of(records, Opcode.MESSAGE_INDEX)
     if not at:
         return mutant_of(good, good.plain)
     for _ in range(rng.choice((1, 1, 1, 4))):
@@ -40,7 +40,7 @@ def flip_message_index(rng: Random, good: Good) -> Mutant:
 def wrong_message_index(rng: Random, good: Good) -> Mutant:
     """Message indexes with pairs that are another's: swapped, doubled, moved in time."""
     records = pieces(good.plain)
-    at = [n for n, each in enumerate(records) if each.opcode == Opcode.MESSAGE_INDEX]
+    at = numbers_of(records, Opcode.MESSAGE_INDEX)
     if not at:
         return mutant_of(good, good.plain)
     number = rng.choice(at)
@@ -72,7 +72,7 @@ def wrong_message_index(rng: Random, good: Good) -> Mutant:
 def wrong_chunk_index(rng: Random, good: Good) -> Mutant:
     """A chunk index that names another chunk, other times, or other message indexes."""
     records = pieces(good.plain)
-    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK_INDEX]
+    at = numbers_of(records, Opcode.CHUNK_INDEX)
     if not at:
         return mutant_of(good, good.plain)
     number, donor = rng.choice(at), records[rng.choice(at)].body
@@ -121,7 +121,7 @@ def _with_flipped_bit(
 ) -> bytes:
     """The file with a bit of one such record flipped, where it has any."""
     records = pieces(good.plain)
-    at = [n for n, each in enumerate(records) if each.opcode == opcode]
+    at = numbers_of(records, opcode)
     if not at:
         return good.plain
     number = rng.choice(at)
@@ -180,8 +180,8 @@ def agreed(plain: bytes, nth: int, told: Callable[[int], int]) -> bytes:
     Every checksum is right, and every message as it was.
     """
     records = pieces(plain)
-    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK][nth]
-    whole = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK_INDEX][nth]
+    at = numbers_of(records, Opcode.CHUNK)[nth]
+    whole = numbers_of(records, Opcode.CHUNK_INDEX)[nth]
     after = at + 1
     while records[after].opcode == Opcode.MESSAGE_INDEX:
         body = bytearray(records[after].body)

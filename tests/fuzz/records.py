@@ -4,6 +4,7 @@ import struct
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from random import Random
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
@@ -46,6 +47,11 @@ def pieces(data: bytes, start: int = len(MAGIC)) -> list[Piece]:
     return found
 
 
+def numbers_of(records: list[Piece], *opcodes: int) -> list[int]:
+    """Where the records of some kinds are."""
+    return [at for at, each in enumerate(records) if each.opcode in opcodes]
+
+
 def without_summary(records: Iterable[Piece]) -> bytes:
     """A file of the records up to the end of its data section, and a footer that names none."""
     out = bytearray(MAGIC)
@@ -62,6 +68,11 @@ def as_it_was(data: bytes, records: Iterable[Piece]) -> bytes:
     known = pieces(data)
     tail = data[known[-1].end :] if known else b""
     return MAGIC + b"".join(each.data for each in records) + tail
+
+
+def with_summary_or_without(rng: Random, data: bytes, records: list[Piece]) -> bytes:
+    """The records, every other time with what came behind the last of them."""
+    return without_summary(records) if rng.random() < 0.5 else as_it_was(data, records)
 
 
 def with_summary_sealed(data: bytes) -> bytes:
