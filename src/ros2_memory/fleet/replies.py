@@ -23,7 +23,7 @@ from ros2_memory.core.reply import PLAIN, JsonObject, Key, with_notes
 from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, Ns, iso_local, unix_rounded_up
 from ros2_memory.tools.replies import ROBOT_NAME
-from ros2_memory.tools.reply_size import to_json_text
+from ros2_memory.tools.reply_size import notes_in, to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -166,13 +166,7 @@ def merge_replies(
         short = [{key: row[key] for key in keys if key in row} for row in whole]
         do = "each robot shortly; pass robot for all of it"
         return with_notes({"robots": [*short], **failed}, [do, *notes])
-    own_notes = _sentences(
-        (reply.name, note)
-        for reply in order
-        # `str(note)` would lose that it is quoted.
-        for note in _items(reply.body, "notes")
-        if isinstance(note, str)
-    )
+    own_notes = _sentences((reply.name, note) for reply in order for note in notes_in(reply.body))
     return with_notes({**body, **failed}, [*own_notes, *notes])
 
 

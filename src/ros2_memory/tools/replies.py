@@ -31,7 +31,15 @@ from ros2_memory.core.reply import (
 from ros2_memory.core.text import quoted_keys
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_rounded_up
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
-from ros2_memory.tools.reply_size import HEADERS, QUOTED, fit_reply, largest, to_json_text
+from ros2_memory.tools.reply_size import (
+    HEADERS,
+    QUOTED,
+    add_notes,
+    fit_reply,
+    largest,
+    notes_in,
+    to_json_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -39,8 +47,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
 
-_LONGEST_LAST_ROW_CHARS: Final = 200
-"""Characters of the row that sums up those left out, whatever its numbers."""
 ROBOT_NAME: Final = "robot_name"
 """The key of the name of a fleet's robot in a reply or a row; `robot` is the place of one."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
@@ -135,29 +141,24 @@ class Replies:
         If the list would be too long, the busiest topics come first, and the last row sums up the
         others: their first and last time and all their messages.
         """
-        shown_rows = [robot | shown(row, Scope()) for row in rows]
-        text = to_json_text([*shown_rows])
+        text = to_json_text([robot | shown(row, Scope()) for row in rows])
         if len(text) <= self.max_chars:
             return text
-        room = self.max_chars - _LONGEST_LAST_ROW_CHARS - len(to_json_text(robot))
-        busiest: list[JsonValue] = []
-        others = sorted(zip(rows, shown_rows, strict=True), key=lambda pair: -pair[0].count)
-        while others:
-            _, busy = others[0]
-            room -= len(to_json_text(busy)) + 1
-            if room < 0:
-                break
-            busiest.append(busy)
-            del others[0]
-        rest = [row for row, _ in others]
-        last = results.TopicRow(
-            f"({len(rest)} more: use pattern)",
-            "",
-            min(row.first for row in rest),
-            max(row.last for row in rest),
-            sum(row.count for row in rest),
-        )
-        return to_json_text([*busiest, robot | shown(last, Scope())])
+        busiest = sorted(rows, key=lambda row: -row.count)
+
+        def text_of(most: int) -> str:
+            rest = busiest[most:]
+            last = results.TopicRow(
+                f"({len(rest)} more: use pattern)",
+                "",
+                min(row.first for row in rest),
+                max(row.last for row in rest),
+                sum(row.count for row in rest),
+            )
+            return to_json_text([robot | shown(row, Scope()) for row in (*busiest[:most], last)])
+
+        fit = largest(0, len(rows) - 1, lambda most: len(text_of(most)) <= self.max_chars)
+        return text_of(fit or 0)
 
     def error(self, error: EpisodicError) -> Reply:
         """Returns the reply for an error. Having no data is an answer; the others are errors."""
@@ -198,10 +199,7 @@ def _of_robot(answer: results.OfRobot) -> JsonObject:
     body = as_json(answer.answer, answer.bag_dir)
     if not isinstance(body, dict):  # null, which means "never"
         body = {"timestamp": None, "value": None}
-    reply: JsonObject = {ROBOT_NAME: answer.name, **body}
-    if answer.notes:
-        reply["notes"] = [*_notes_in(body), *answer.notes]
-    return reply
+    return add_notes({ROBOT_NAME: answer.name, **body}, answer.notes)
 
 
 def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
@@ -269,12 +267,12 @@ def _split_shared(
         for key, value in (answered[0] if answered else {}).items()
         if may_be_shared(key, value) and all(reply.get(key) == value for reply in answered)
     }
-    occurrences = Counter(note for reply in replies for note in dict.fromkeys(_notes_in(reply)))
+    occurrences = Counter(note for reply in replies for note in dict.fromkeys(notes_in(reply)))
     common_notes = [note for note, times in occurrences.items() if times > 1]
     rows = [
         with_notes(
             {key: value for key, value in reply.items() if key not in shared and key != "notes"},
-            [note for note in _notes_in(reply) if note not in common_notes],
+            [note for note in notes_in(reply) if note not in common_notes],
         )
         for reply in replies
     ]
@@ -298,11 +296,6 @@ def _sums(replies: Sequence[JsonObject], *, is_all: bool) -> JsonObject:
         if numbers:
             sums[key] = round(sum(numbers), 3)
     return sums
-
-
-def _notes_in(reply: JsonObject) -> list[str]:
-    notes = reply.get("notes")
-    return [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
 
 
 def _shortened(answer: results.Comparison | results.Things, bag_dir: Path) -> JsonObject:
