@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from datetime import date
+from datetime import UTC, date, datetime
 from itertools import compress, groupby
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
@@ -144,7 +144,7 @@ def _summed_ages(edges: Ints, times: Ints) -> Ints:
     return counts_before.astype(np.int64) * edges - sums[counts_before]
 
 
-def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -> TimeBins:
+def time_bins(window: TimeWindow, by: ClockBin) -> TimeBins:
     """Returns the bins of a window that is not empty.
 
     Raises:
@@ -154,8 +154,8 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
     most_days = MOST_BINS if by == "day" else MOST_DAYS
     if days_long > most_days:
         raise _too_long(by, most_days)
-    starts = _piece_starts(window, _HOUR_S if by == "hour" else _DAY_S, offset)
-    locals_s = [start // NS_PER_S + offset(start // NS_PER_S) for start in starts]
+    starts = _piece_starts(window, _HOUR_S if by == "hour" else _DAY_S)
+    locals_s = [_local_s(start // NS_PER_S) for start in starts]
     days = [local_s // _DAY_S for local_s in locals_s]
     if by == "day":
         bin_of_piece = days
@@ -175,14 +175,14 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
     )
 
 
-def _piece_starts(window: TimeWindow, unit_s: int, offset: Offset) -> list[Ns]:
+def _piece_starts(window: TimeWindow, unit_s: int) -> list[Ns]:
     """Returns the window's start, and the times at which a local day (or hour) begins in it."""
     starts = [window.start]
     last_s = (window.stop - 1) // NS_PER_S
-    edge_s = _next_edge(window.start // NS_PER_S, unit_s, offset)
+    edge_s = _next_edge(window.start // NS_PER_S, unit_s)
     while edge_s <= last_s:
         starts.append(edge_s * NS_PER_S)
-        edge_s = _next_edge(edge_s, unit_s, offset)
+        edge_s = _next_edge(edge_s, unit_s)
     return starts
 
 
@@ -193,34 +193,17 @@ def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
     )
 
 
-def _next_edge(at_s: int, unit_s: int, offset: Offset) -> int:
+def _next_edge(at_s: int, unit_s: int) -> int:
     """Returns the next Unix second in which another local day (or hour) begins."""
-    while True:
-        ahead_s = offset(at_s)
-        following_s = at_s - (at_s + ahead_s) % unit_s + unit_s
-        if offset(following_s) == ahead_s:
-            return following_s
-        changed_s = _clock_change(at_s, following_s, offset)
-        if (changed_s + offset(changed_s)) // unit_s != (changed_s - 1 + ahead_s) // unit_s:
-            return changed_s
-        at_s = changed_s
+    following_s = (_local_s(at_s) // unit_s + 1) * unit_s
+    # If clocks skip its beginning, that counts by the offset before: it is when they are changed.
+    following = datetime.fromtimestamp(following_s, UTC).replace(tzinfo=None)
+    return int(following.timestamp())
 
 
-def _clock_change(before_s: int, after_s: int, offset: Offset) -> int:
-    """Returns the first Unix second between two at which local time has another offset."""
-    old = offset(before_s)
-    while after_s - before_s > 1:
-        middle_s = (before_s + after_s) // 2
-        if offset(middle_s) == old:
-            before_s = middle_s
-        else:
-            after_s = middle_s
-    return after_s
-
-
-def _time_of_day(at_s: int) -> int:
-    """Returns the seconds since local midnight at a Unix second."""
-    return (at_s + local_offset(at_s)) % _DAY_S
+def _local_s(at_s: int) -> int:
+    """Returns the seconds of local time since the epoch at a Unix second."""
+    return at_s + local_offset(at_s)
 
 
 def _bin_name(number: int, by: ClockBin) -> str:
@@ -316,7 +299,6 @@ class BinnedWindow:
         gaps: the spans of `window` in which nothing was recorded.
         elapsed: how much time passed between log times of `window`.
         usual: the usual time of day of the first begin, if that is counted.
-        usual_exit: the usual time of day of the first exit, if that is counted.
 
     Raises:
         InvalidArgumentsError: there are too many bins, or there is no named place.
@@ -348,7 +330,6 @@ class BinnedWindow:
             self.bins = time_bins(self.window, by)
         self._columns: list[_Column] = []
         self.usual: Usual | None = None
-        self.usual_exit: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
         self.elapsed = elapsed_in(view, self.window)
         self._since: Ns | None = None
@@ -443,7 +424,7 @@ class BinnedWindow:
         days, firsts = np.unique(self.bins.day_of[self.bins.pieces(ordered)], return_index=True)
         whole_days = self._whole_days(self.bins.day_of.tolist())
         clock_s = sorted(
-            _time_of_day(at // NS_PER_S)
+            _local_s(at // NS_PER_S) % _DAY_S
             for day, at in zip(days.tolist(), ordered[firsts].tolist(), strict=True)
             if day in whole_days
         )
@@ -473,7 +454,7 @@ class BinnedWindow:
         """Returns whether the first local day has something recorded before the window."""
         start = self.window.start
         start_s = start // NS_PER_S
-        before = TimeWindow((start_s - _time_of_day(start_s)) * NS_PER_S, start)
+        before = TimeWindow((start_s - _local_s(start_s) % _DAY_S) * NS_PER_S, start)
         first, last = shown_span(self.view.snapshot, before)
         unrecorded = length_in([*recording_gaps(self.view, before)], first, last)
         # The memory's own start was rounded to be asked for: up to a second is not recorded.
@@ -536,7 +517,6 @@ class BinnedWindow:
             rows=tuple(rows),
             all=tuple(column.whole for column in columns),
             usual=self.usual,
-            usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),
         )
 

@@ -185,7 +185,6 @@ def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
     binned.add_first("first_entry", entries)
     binned.add_first("first_exit", exits)
     binned.usual = binned.usual_of(entries)
-    binned.usual_exit = binned.usual_of(exits)
 
 
 def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Stay]]) -> None:

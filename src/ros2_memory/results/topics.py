@@ -427,7 +427,6 @@ class Usual:
     TIME("start"),
     TIME("end"),
     OBJECT("usual_first", "usual").if_known,
-    OBJECT("usual_exit").if_known,
 )
 class Bins(AnswerWithNotes):
     """Counts for each bin of a window.
@@ -440,7 +439,6 @@ class Bins(AnswerWithNotes):
         rows: name and values of each bin; None for a missing value.
         all: the values of all bins together.
         usual: when the first one of a day begins, if beginnings are counted.
-        usual_exit: when the robot first leaves on a day, if visits are counted.
     """
 
     by: str
@@ -451,7 +449,6 @@ class Bins(AnswerWithNotes):
     rows: tuple[tuple[str, tuple[float | None, ...]], ...]
     all: tuple[float | None, ...]
     usual: Usual | None = None
-    usual_exit: Usual | None = None
 
     @property
     def topic(self) -> JsonValue:
