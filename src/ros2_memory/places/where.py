@@ -192,22 +192,25 @@ def _parse_place(
         none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
         listed = f"there are: {names}" if names else none
         raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(value)}; {listed}")
-    if not isinstance(value, dict):
+    region = _region_of(value, default_radius_m)
+    if region is None:
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    unknown = value.keys() - _REGION_KEYS
-    if unknown:
-        raise InvalidArgumentsError(f"{what} has no {abbreviate(min(unknown))}; {_EXPECTED}")
-    x, y = value.get("x"), value.get("y")
-    if isinstance(x, list) or isinstance(y, list):
-        if "radius_m" in value:
-            raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
-        return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
+    return Where(region)
+
+
+def _region_of(value: JsonValue, default_radius_m: float | None) -> Region | None:
+    """Returns the rectangle or circle that an object describes; None if it describes none."""
+    if not isinstance(value, dict) or value.keys() - _REGION_KEYS:
+        return None
+    match value:
+        case {"x": [_, _] as x_range, "y": [_, _] as y_range} if "radius_m" not in value:
+            min_x, max_x, min_y, max_y = bounds = [as_float(end) for end in (*x_range, *y_range)]
+            is_region = min_x < max_x and min_y < max_y and all(map(math.isfinite, bounds))
+            return Rectangle(min_x, max_x, min_y, max_y) if is_region else None
     radius = value.get("radius_m", default_radius_m)
-    circle = Circle(as_float(x), as_float(y), as_float(radius))
-    is_finite = math.isfinite(circle.x) and math.isfinite(circle.y)
-    if not (is_finite and math.isfinite(circle.radius_m) and circle.radius_m > 0):
-        raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    return Where(circle)
+    numbers = [as_float(number) for number in (value.get("x"), value.get("y"), radius)]
+    is_region = all(map(math.isfinite, numbers)) and numbers[2] > 0
+    return Circle(*numbers) if is_region else None
 
 
 def places_asked(
@@ -232,17 +235,6 @@ def _place_named(limits: QuerySettings, name: str) -> Place | None:
         if caseless(" ".join(place.name.split())) == wanted:
             return place
     return None
-
-
-def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
-    match value:
-        case [low_value, high_value]:
-            low, high = as_float(low_value), as_float(high_value)
-            if low < high and math.isfinite(low) and math.isfinite(high):
-                return low, high
-    raise InvalidArgumentsError(
-        f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
-    )
 
 
 def note_other_frame(

@@ -170,8 +170,9 @@ def _shorter_part(key: str, item: JsonValue, most: int) -> JsonValue:
 
 def _shorter_row(row: JsonValue, most: int) -> JsonValue:
     """Returns an element of a list shortened; a row of a table has all its cells."""
-    is_cells = isinstance(row, list)
-    return [_shorter(cell, most) for cell in row] if is_cells else _shorter(row, most)
+    if isinstance(row, list):
+        return [_shorter(cell, most) for cell in row]
+    return _shorter(row, most)
 
 
 def _shorter(value: JsonValue, most: int) -> JsonValue:

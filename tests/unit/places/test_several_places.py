@@ -94,13 +94,13 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
         (",", 'no place is named ","'),
         (["hall", 5], "give the name of a place"),
         ({"hall": 5, "den": "den"}, 'where: "hall" was 5; give'),
-        ({"hall": {"x": [5, 1], "y": [0, 1]}, "den": "den"}, 'where: "hall": x was [5, 1]'),
-        ({"hall": {"z": 1}}, 'where: "hall" has no "z"; give'),
-        ({"x": 1, "y": 2, "radius": 3}, 'where has no "radius"; give'),
+        ({"hall": {"x": [5, 1], "y": [0, 1]}, "den": "den"}, 'where: "hall" was {"x": [5, 1]'),
+        ({"hall": {"z": 1}}, 'where: "hall" was {"z": 1}; give'),
+        ({"x": 1, "y": 2, "radius": 3}, "where was {"),
         ({f"p{nth}": {"x": nth, "y": 0, "radius_m": 1} for nth in range(31)}, "more than 30"),
-        ({"x": [1, 0], "y": [0, 1]}, "not a range"),
-        ({"x": [1, 1], "y": [0, 1]}, "not a range"),  # a line, on which no pose ever is
-        ({"x": [0, 1], "y": [0, 1], "radius_m": 1}, "radius_m and a range"),
+        ({"x": [1, 0], "y": [0, 1]}, "where was {"),
+        ({"x": [1, 1], "y": [0, 1]}, "where was {"),  # a line, on which no pose ever is
+        ({"x": [0, 1], "y": [0, 1], "radius_m": 1}, "where was {"),
         (5, "where was 5; give the name"),
     ],
 )
