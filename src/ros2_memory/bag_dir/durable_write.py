@@ -25,6 +25,8 @@ _COMMON: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _REPLACE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _COMMON
 _APPEND: Final = os.O_RDWR | os.O_APPEND | _COMMON
 _READ: Final = os.O_RDONLY | _COMMON
+_WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
+"""Errors of mounts that have no locks, as NFS may be."""
 _LOCK_WAIT_S: Final = 2.0
 _POLL_S: Final = 0.01
 
@@ -88,6 +90,8 @@ def append_durably(target: Path, text: str) -> None:
 def locked(path: Path, flags: int = 0) -> Iterator[int]:
     """Yields a descriptor of a file, for reading and appending. Other writers wait meanwhile.
 
+    On a mount without locks they do not: what is appended is whole all the same.
+
     Raises:
         OSError: the file cannot be opened, or another writer holds the lock for long.
     """
@@ -96,7 +100,7 @@ def locked(path: Path, flags: int = 0) -> Iterator[int]:
         descriptor = os.open(path, _APPEND | flags, 0o666)
         try:
             with suppress(BlockingIOError):
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(descriptor)
                 # Another writer may have replaced the file before this one locked it.
                 if is_open_file(path, descriptor):
                     yield descriptor
@@ -106,6 +110,14 @@ def locked(path: Path, flags: int = 0) -> Iterator[int]:
         if time.monotonic() >= give_up:
             raise BlockingIOError(f"another program has locked {path}")
         time.sleep(_POLL_S)
+
+
+def _lock(descriptor: int) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in _WITHOUT_LOCKS:
+            raise
 
 
 def append_lines(descriptor: int, text: str) -> None:

@@ -13,8 +13,9 @@ these bins may add up to more than the window.
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import date
 from itertools import compress, groupby
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
@@ -195,10 +196,17 @@ def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
 
 def _next_edge(at_s: int, unit_s: int) -> int:
     """Returns the next Unix second in which another local day (or hour) begins."""
-    following_s = (_local_s(at_s) // unit_s + 1) * unit_s
-    # If clocks skip its beginning, that counts by the offset before: it is when they are changed.
-    following = datetime.fromtimestamp(following_s, UTC).replace(tzinfo=None)
-    return int(following.timestamp())
+    while True:
+        ahead_s = local_offset(at_s)
+        following_s = at_s - (at_s + ahead_s) % unit_s + unit_s
+        if local_offset(following_s) == ahead_s:
+            return following_s
+        # The clock is changed before: to the same hour or to another one, perhaps an earlier one.
+        seconds = range(at_s, following_s)
+        changed_s = at_s + bisect_left(seconds, True, key=lambda at: local_offset(at) != ahead_s)
+        if _local_s(changed_s) // unit_s != (changed_s - 1 + ahead_s) // unit_s:
+            return changed_s
+        at_s = changed_s
 
 
 def _local_s(at_s: int) -> int:

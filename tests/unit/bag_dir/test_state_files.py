@@ -4,6 +4,7 @@ They are given as an installed robot has them on its disk, so their formats are 
 """
 
 import errno
+import fcntl
 import os
 import re
 import stat
@@ -385,6 +386,15 @@ def test_rows_that_one_program_appends_while_another_shortens_the_file_stay(
     with ThreadPoolExecutor(2) as pool:
         [*pool.map(lambda loss: append_losses(tmp_path, [loss]), losses)]
     assert {*read_losses(tmp_path, 0, 2 * T0)} == {*losses}
+
+
+def test_on_a_mount_without_locks_receipts_are_appended(tmp_path: Path) -> None:
+    receipt = Receipt("rec/rec_0.mcap", "id", 1, "00", "lake", 1)
+    with broken(fcntl, "flock", errno.ENOLCK):
+        append_receipts(tmp_path, [receipt])
+    with broken(fcntl, "flock", errno.EIO), pytest.raises(OSError, match="Input/output"):
+        append_receipts(tmp_path, [receipt])
+    assert read_receipts(tmp_path) == {receipt.bag: receipt}
 
 
 def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(

@@ -33,7 +33,9 @@ EPOCH = 719163
 BERLIN = "CET-1CEST,M3.5.0,M10.5.0/3"
 LORD_HOWE = "<+1030>-10:30<+11>-11,M10.1.0,M4.1.0"
 HAVANA = "CST5CDT,M3.2.0/0,M11.1.0/1"
-ZONES = ("UTC", BERLIN, LORD_HOWE, HAVANA, "<+0545>-5:45")
+TROLL = "<+00>0<+02>-2,M3.5.0/1,M10.5.0/3"
+BACK_BEHIND_MIDNIGHT = "NST3:30NDT,M3.2.0/0:01,M11.1.0/0:01"  # St. John's until 2011
+ZONES = ("UTC", BERLIN, LORD_HOWE, HAVANA, "<+0545>-5:45", TROLL, BACK_BEHIND_MIDNIGHT)
 """Written out, so that they do not depend on the machine's time zone files."""
 
 
@@ -78,6 +80,21 @@ def test_every_time_is_in_the_bin_of_its_local_time(
     assert bins.names[int(bins.member[bins.pieces([when])[0]].argmax())] == expected
     assert bins.day_of is not None
     assert bins.day_of[bins.pieces([when])[0]] == local.date().toordinal() - EPOCH
+
+
+@pytest.mark.parametrize(
+    ("name", "by", "begin"),
+    [(TROLL, "hour", "2025-10-26T01:30Z"), (BACK_BEHIND_MIDNIGHT, "day", "2025-11-02T03:00Z")],
+)
+def test_what_clocks_repeat_is_in_order(name: str, by: ClockBin, begin: str) -> None:
+    start = int(datetime.fromisoformat(begin).timestamp()) * S
+    window = TimeWindow(start, start + 6 * H * S)
+    with zone(name):
+        bins = time_bins(window, by)
+        for at in range(window.start, window.stop, 60 * S):
+            local = datetime.fromtimestamp(at // S, UTC).astimezone()
+            expected = local.date().isoformat() if by == "day" else f"{local.hour:02d}:00"
+            assert bins.names[int(bins.member[bins.pieces([at])[0]].argmax())] == expected
 
 
 @given(windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES), st.data())
