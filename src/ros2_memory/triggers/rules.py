@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.refusals import refusal_for
-from ros2_memory.bag_dir.layout import named_start
+from ros2_memory.bag_dir.layout import named_start, split_number
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, UndecodableError
@@ -202,10 +202,9 @@ def parts_of(
     """
     splits: dict[int, BagFile] = {}
     for bag in bags:
-        stem = bag.file.removesuffix(COMPRESSED).removesuffix(".mcap")
-        number = stem.rpartition(f"/{recording}_")[2]
-        if number.isdecimal():
-            splits[int(number)] = bag
+        number = split_number(recording, bag.path.name.removesuffix(COMPRESSED))
+        if number is not None:
+            splits[number] = bag
     parts: dict[str, list[BagFile]] = {}
     part, end, last = recording, MIN_NS, MAX_NS
     for nth, bag in sorted(splits.items()):
