@@ -25,7 +25,7 @@ from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
@@ -174,7 +174,7 @@ class HeldValues:
             if chars > _MOST_CHARS:
                 self.reached = self.known[-1].start if self.known else stop
                 raise QueryTimeoutError(f"the values take more than {_MOST_CHARS:,} characters")
-            if held.stop > start:
+            if held.stop > start or held.start >= start - START_SLACK_NS:
                 self.known.append(held)
             if held.start <= start:
                 break

@@ -344,7 +344,7 @@ def _state_at_end(
             yield flag_name(topic, flag), bool(flag.last)
         goals, _ = events.of_kind(GOAL)
         if goals:
-            newest = max(goals, key=lambda state: state.at)
+            newest = max(goals, key=lambda state: (state.at, state.last in _ACTIVE_GOAL))
             word = GOAL_WORDS.get(newest.last, "active")
             is_active = newest.last in _ACTIVE_GOAL
             if is_active and last_listings(view, topic, window, {newest.name}):

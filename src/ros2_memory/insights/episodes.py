@@ -134,10 +134,11 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
         if waiting is not None:
             yield waiting if held is None else replace(waiting, previous=spell_of(held))
             waiting = None
-        if held is None or held.stop <= start:
+        if held is None or (held.stop <= start and held.start < scope.window.start):
             return
         if condition.matches({"value": held.exact}) and scope.holds_at(held.start):
-            following = newer or values.named_after(held.stop)
+            # What no message ended may stop with its own last one.
+            following = newer or values.named_after(held.stop + (not held.ended))
             after = None if following is None else spell_of(following)
             waiting = Episode(spell_of(held), None, after)
         newer = held

@@ -224,6 +224,18 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
     assert reply["state"] == {"/docked": True} | ({"/drive goal": "active"} if listed_again else {})
 
 
+@pytest.mark.parametrize("ended", [1, 2])
+def test_a_goal_that_runs_is_the_state_beside_an_older_one_that_stays_listed(
+    tmp_path: Path, ended: int
+) -> None:
+    running = 3 - ended
+    listed = [goals(at(10), {ended: 4}), goals(at(40), {ended: 4, running: 2})]
+    write_mcap(tmp_path / "bag.mcap", [*(odom(at(nth)) for nth in range(250)), *listed])
+    for moment in (45, 200):
+        reply = asked(memory_of(tmp_path), "recap", around=at(moment) / S)
+        assert reply["state"]["/drive goal"] == "active"
+
+
 def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_path: Path) -> None:
     said = [boolean(at(t), value, "/docked") for t, value in ((0, True), (7200, False))]
     said.append(goals(at(0), {1: 2}))

@@ -394,6 +394,29 @@ def test_values_that_are_too_long_to_be_held_are_named(
     assert f"only what is after {T0 + 200}.000000 is counted" in note
 
 
+@each_way
+def test_the_last_text_of_all_is_found_from_its_own_time_on_and_follows_itself_nowhere(
+    tmp_path: Path, recalls: bool
+) -> None:
+    said = {5: "fetch", 20: "", **dict.fromkeys(range(30, 61), "dock")}
+    drive = [odom((T0 + nth) * S) for nth in range(61)]
+    write_mcap(tmp_path / "run" / "run_0.mcap", drive)
+    texts = [text((T0 + at) * S, word) for at, word in said.items()]
+    write_mcap(tmp_path / "run" / "run_1.mcap", texts)
+    wanted = {"topic": "/chatter", "condition_type": "contains", "value": "dock"}
+    memory = memory_of(tmp_path, recalls=recalls)
+    [episode] = asked(memory, "find_matches", **wanted)["episodes"]
+    assert (episode["start"], episode.get("next")) == (T0 + 30, None)
+    write_mcap(tmp_path / "run" / "run_1.mcap", [*texts[:2], texts[-1]])
+    memory = memory_of(tmp_path, recalls=recalls)
+    for start in (T0 + 30, T0 + 60):
+        window = {"start": start, "end": T0 + 70}
+        [episode] = asked(memory, "find_matches", **wanted, **window)["episodes"]
+        assert episode["start"] == T0 + 60
+        changes = asked(memory, "get_topic_in_range", topic="/chatter", changes=True, **window)
+        assert [row["value"] for row in changes["changes"]][-1] == "dock"
+
+
 def test_of_more_episodes_than_are_counted_the_newest_are(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
