@@ -1,7 +1,6 @@
 """What tests of the home robot's world share. Files that use it are of the group "home"."""
 
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 from tests.home.days import Scale
 from tests.home.recording import write_world
 from tests.home.year import Year
+from tests.support.clocks import in_zone
 
 
 @pytest.fixture(scope="session")
@@ -30,10 +30,7 @@ def thinned_home(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def in_utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def in_utc() -> Iterator[None]:
     """Has this process's days begin and end as those of the robot do."""
-    with monkeypatch.context() as patched:
-        patched.setenv("TZ", "UTC")
-        time.tzset()
+    with in_zone("UTC"):
         yield
-    time.tzset()

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import time
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -21,6 +20,7 @@ from ros2_memory.serving.mcp_server import (
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.build import build_tools
 from tests.project import reference_tables as reference
+from tests.support.clocks import in_zone
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
 from tests.support.memories import ROOT
 
@@ -37,11 +37,8 @@ def page(name: str) -> str:
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str]]:
     """What the server says to every call of the page, where the time zone is UTC."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", "UTC")
-        time.tzset()
+    with in_zone("UTC"):
         yield replies(write_history(tmp_path_factory.mktemp("history") / "bags"))
-    time.tzset()
 
 
 def compare(name: str, part: str, expected: str) -> None:

@@ -1,7 +1,6 @@
 """Times: as floats of seconds, as local times, as texts, and windows of them."""
 
 import math
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, timezone
 
@@ -25,6 +24,7 @@ from ros2_memory.core.timebase import (
     unix_from_text,
     unix_rounded_up,
 )
+from tests.support.clocks import in_zone
 from tests.support.strategies import moments
 
 ZONES = ["UTC", "CET-1CEST,M3.5.0,M10.5.0/3", "EST5EDT,M3.2.0,M11.1.0", "<+0545>-5:45"]
@@ -36,11 +36,8 @@ OFFSETS = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(
 
 @pytest.fixture(params=ZONES)
 def zone(request: pytest.FixtureRequest) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", request.param)
-        time.tzset()
+    with in_zone(request.param):
         yield
-    time.tzset()
 
 
 @given(moments)

@@ -1,9 +1,6 @@
 """Counts by times of the clock, and by labels as the messages say that the test wrote."""
 
 import json
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +18,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, TimeBins, time_bins
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, text, write_mcap, write_splits
+from tests.support.clocks import in_zone
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
@@ -39,18 +37,9 @@ ZONES = ("UTC", BERLIN, LORD_HOWE, HAVANA, "<+0545>-5:45", TROLL, BACK_BEHIND_MI
 """Written out, so that they do not depend on the machine's time zone files."""
 
 
-@contextmanager
-def zone(name: str) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", name)
-        time.tzset()
-        yield
-    time.tzset()
-
-
 def hours(by: ClockBin, *days: str) -> dict[str, float]:
     """How long each bin is from the beginning of one day to that of another, in Berlin."""
-    with zone(BERLIN):
+    with in_zone(BERLIN):
         start, stop = (int(datetime.fromisoformat(f"2026-{day}").timestamp()) * S for day in days)
         bins = time_bins(TimeWindow(start, stop), by)
     found = bins.lengths([start], [stop]) @ bins.member
@@ -69,7 +58,7 @@ def test_every_time_is_in_the_bin_of_its_local_time(
     window: TimeWindow, by: ClockBin, name: str, data: st.DataObject
 ) -> None:
     when = data.draw(st.integers(window.start, window.stop - 1))
-    with zone(name):
+    with in_zone(name):
         bins = time_bins(window, by)
         local = datetime.fromtimestamp(when // S, UTC).astimezone()
     expected = {
@@ -89,7 +78,7 @@ def test_every_time_is_in_the_bin_of_its_local_time(
 def test_what_clocks_repeat_is_in_order(name: str, by: ClockBin, begin: str) -> None:
     start = int(datetime.fromisoformat(begin).timestamp()) * S
     window = TimeWindow(start, start + 6 * H * S)
-    with zone(name):
+    with in_zone(name):
         bins = time_bins(window, by)
         for at in range(window.start, window.stop, 60 * S):
             local = datetime.fromtimestamp(at // S, UTC).astimezone()
@@ -101,7 +90,7 @@ def test_what_clocks_repeat_is_in_order(name: str, by: ClockBin, begin: str) -> 
 def test_spans_are_shared_out_without_loss(
     window: TimeWindow, by: ClockBin, name: str, data: st.DataObject
 ) -> None:
-    with zone(name):
+    with in_zone(name):
         bins = time_bins(window, by)
     moments = st.integers(window.start - 10**15, window.stop + 10**15)
     spans = [sorted(each) for each in data.draw(st.lists(st.tuples(moments, moments)))]
@@ -122,6 +111,7 @@ def test_a_day_has_23_or_25_hours_where_clocks_are_changed() -> None:
     assert "02:00" not in hours("hour", "03-29", "03-30")
 
 
+@in_zone("UTC")
 def test_more_bins_than_a_reply_has_room_for_are_refused() -> None:
     def bins(by: ClockBin, days: int) -> TimeBins:
         return time_bins(TimeWindow(1, days * 86_400 * S), by)

@@ -16,6 +16,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
 from tests.support.bags import Msg, battery, make, odom, text, write_mcap, write_splits
+from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.tables import table
 
@@ -42,6 +43,7 @@ def cells(answer: Bins, name: str) -> list[float | None]:
     return [*(values[at] for _, values in answer.rows), answer.all[at]]
 
 
+@in_zone("UTC")
 def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,6 +127,7 @@ def test_no_number_is_lost_where_time_runs_out_while_a_table_is_counted(tmp_path
     assert len(sizes_counted(memory, range(1, 40, 3))) > 1
 
 
+@in_zone("UTC")
 def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
     tmp_path: Path,
 ) -> None:

@@ -20,6 +20,7 @@ from ros2_memory.results import Sightings
 from ros2_memory.tools.arguments import _as_hours
 from ros2_memory.tools.replies import as_json
 from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
+from tests.support.clocks import in_zone
 from tests.support.memories import asked, memory_of, remembered
 from tests.support.rooms import S, asked_of, draw, write
 
@@ -34,11 +35,8 @@ HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
 
 @pytest.fixture(autouse=True, scope="module")
 def _in_utc() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("TZ", "UTC")
-        time.tzset()
+    with in_zone("UTC"):
         yield
-    time.tzset()
 
 
 @pytest.fixture(scope="module")
@@ -184,9 +182,7 @@ def test_hours_that_clocks_repeat_count_twice_and_those_that_they_skip_are_left_
     where: str, hours: str, expected: str
 ) -> None:
     zone, days = where.split()
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("TZ", zone)
-        time.tzset()
+    with in_zone(zone):
         begin, end = (int(datetime.fromisoformat(at).timestamp()) for at in days.split("/"))
         found = hours_of_days(TimeWindow(begin * S, end * S), *_as_hours(hours))  # type: ignore[misc]
         shown = [
@@ -195,7 +191,6 @@ def test_hours_that_clocks_repeat_count_twice_and_those_that_they_skip_are_left_
             )
             for each in found
         ]
-    time.tzset()
     assert " ".join(shown) == expected
 
 

@@ -32,6 +32,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
+from tests.support.clocks import in_zone
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
@@ -333,6 +334,7 @@ def found_in(
     ]
 
 
+@in_zone("UTC")
 def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_status(
     tmp_path: Path,
 ) -> None:

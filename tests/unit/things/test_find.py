@@ -23,6 +23,7 @@ from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known, unseen
 from ros2_memory.things.find import find_things
 from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
+from tests.support.clocks import in_zone
 from tests.support.memories import asked, memory_of, with_store
 
 S = 10**9
@@ -415,6 +416,7 @@ def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path) -> None:
         assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
 
 
+@in_zone("UTC")
 def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
     """Every morning on the table, every afternoon elsewhere, for two weeks."""
     table, shelf = ("mug", 3.0, 0.5), ("mug", 3.0, -1.0)

@@ -1,7 +1,6 @@
 """Times in replies: local beside Unix time over days, and as text that finds its message again."""
 
 import re
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
+from tests.support.clocks import in_zone
 from tests.support.memories import asked, memory_of
 from tests.support.program import Program, exits
 
@@ -81,12 +81,9 @@ def drive(tmp_path: Path) -> Memory:
 
 
 @pytest.fixture
-def berlin(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("TZ", "Europe/Berlin")
-    time.tzset()
-    yield
-    monkeypatch.undo()
-    time.tzset()
+def berlin() -> Iterator[None]:
+    with in_zone("Europe/Berlin"):
+        yield
 
 
 def utc(seconds: int, decimals: str = "") -> str:
