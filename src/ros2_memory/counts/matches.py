@@ -56,6 +56,7 @@ from ros2_memory.history.held_values import (
     held_at,
     held_until,
     holds_on,
+    is_latched,
     is_text,
 )
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
@@ -64,7 +65,7 @@ from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
-from ros2_memory.insights.topic_events import events_back, flags_before
+from ros2_memory.insights.topic_events import events_back, flags_before, is_unbroken
 from ros2_memory.places.where import Scope, Where, WhileCondition, heard_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
@@ -313,13 +314,15 @@ def _flag_spans(
 
     `before` is whether it held when the window began, or None if no earlier message says so.
     """
-    _, end = binned.counted.asked()
+    start, end = binned.counted.asked()
     events = joined_events([part.without_sights() for part in parts])
     states = _flag_states(binned, topic, events, condition, before, wanted=wanted)
     if states is None:
         return None
-    if events is not None:
-        end = held_until(binned.view, topic, events.last, max(events.last, end))
+    last = start if events is None else events.last
+    is_holding = holds_on(binned.view, [topic])
+    if events is not None or is_holding:
+        end = held_until(binned.view, topic, last, max(last, end), through_silences=is_holding)
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
     gaps = _gaps_for_topic(binned, topic)
     spans: list[_HeldSpan] = []
@@ -363,28 +366,33 @@ def _flag_states(
 
 
 def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:
-    """Returns whether a latched topic met a condition when the window began.
+    """Returns whether a latched or rare topic met a condition when the window began.
 
     None if it said nothing before that still held then.
     """
-    held = held_at(binned.view, topic, binned.counted.asked()[0])
-    value = None if held is None else binned.view.value(held)
+    view = binned.view
+    start, _ = binned.counted.asked()
+    held = held_at(view, topic, start)
+    if held is None and not is_latched(view, topic) and holds_on(view, [topic]):
+        newest = view.stream.last(topic, start)
+        if newest is not None and is_unbroken(view, topic, newest.time, start):
+            held = newest
+    value = None if held is None else view.value(held)
     return None if value is None else condition.matches(value)
 
 
 def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     """Returns the gaps of the recording, each prolonged until the topic is heard again."""
-    view = binned.view
-    if view.limits.latching.is_latched(view.snapshot, topic):
+    if is_latched(binned.view, topic):
         return binned.gaps
     firsts, lasts = binned.bounds([topic])
     order = np.argsort(lasts)
     begins, ends = bounds_of(binned.gaps)
     # The topic is heard again in the bags that end after the gap. If one of them begins before the
-    # gap, or if there are none, the gap is not prolonged.
+    # gap, it is not prolonged.
     following = np.searchsorted(lasts[order], ends)
     earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
-    heard_again = np.append(earliest, MIN_NS)[following].clip(ends)
+    heard_again = np.append(earliest, binned.counted.stop)[following].clip(ends)
     return spans_of(begins, heard_again)
 
 

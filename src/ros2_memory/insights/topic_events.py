@@ -79,13 +79,13 @@ def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
     """
     holds_on = is_latched(view, topic)
     message = held_at(view, topic, first) if holds_on else view.stream.last(topic, first)
-    if message is None or not (holds_on or _is_unbroken(view, topic, message.time, first)):
+    if message is None or not (holds_on or is_unbroken(view, topic, message.time, first)):
         return {}
     flags, _ = (events_of_messages(view, [message]) or TopicEvents(1, 0)).of_kind(FLAG)
     return {flag.name: bool(flag.last) for flag in flags}
 
 
-def _is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
+def is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
     """Returns whether no message of a topic can be missing between two log times (ns)."""
     between = TimeWindow(before, first)
     is_broken = any(between.contains(at) for at in breaks_of(view, topic))
@@ -346,7 +346,7 @@ def _listed_before(
         return {}, False
     goals, _ = earlier.of_kind(GOAL)
     is_whole = not (earlier.beyond or earlier.undecodable)
-    is_all = is_whole and _is_unbroken(view, topic, message.time, events.first)
+    is_all = is_whole and is_unbroken(view, topic, message.time, events.first)
     return {goal.name: goal.last for goal in goals}, is_all
 
 

@@ -127,6 +127,31 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     assert whole(79, 95) == whole(85, 95) == [0, 0]
 
 
+@each_way
+@pytest.mark.parametrize(
+    ("first", "last", "began", "held"),
+    [
+        (0, 10_000, 2, 1000 + 1999),
+        (4500, 4800, 0, 300),
+        (3000, 4500, 1, 500),
+        (4500, 7000, 1, 500 + 1000),
+        (7500, 10_000, 0, 499),
+        (8500, 9500, 0, 0),
+    ],
+)
+def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after_a_gap(
+    tmp_path: Path, first: int, last: int, began: int, held: int, recalls: bool
+) -> None:
+    """Nothing is recorded from 7999 to 8500 s."""
+    changes = ((100, False), (4000, True), (5000, False), (6000, True))
+    messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
+    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(10_001) if not 8000 <= at < 8500]
+    write_splits(tmp_path, messages, 2000)
+    counted = matches(tmp_path, BUMPER, first, last, by="hour", recalls=recalls)
+    whole = table(counted)["all"]
+    assert (whole["count"], whole["seconds"]) == (began, held)
+
+
 TRUE = 1_784_030_400
 UNSET = 86_400
 AHEAD = 2_082_758_400
