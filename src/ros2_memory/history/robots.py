@@ -56,8 +56,17 @@ _OWN: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that the recorder of the bag directory made."""
 _MISDATED: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings with a wrong date."""
-_PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
-"""Of a memory: by path of a closed recording, the parent of each static frame."""
+
+
+class _StaticTree(NamedTuple):
+    """The parent of each static frame in a recording, and a hash of the files that say so."""
+
+    files: int
+    parents: Mapping[str, str]
+
+
+_TREES: Final[Key[dict[str, _StaticTree]]] = Key()
+"""Of a memory: what closed recordings say of static frames, by path."""
 _LONG_NS: Final = 30 * NS_PER_S
 """A shorter overlap at the ends of two recordings is named in the answers that it touches alone."""
 ADVICE: Final = "; data.recording selects one recording"
@@ -132,16 +141,19 @@ def _shared_topics(view: View) -> Iterator[str]:
 
 def _contradicting_frames(view: View) -> Iterator[str]:
     """Yields a sentence on each static frame that has different parents in two recordings."""
-    remembered = view.memory.memo.of(_PARENTS, dict)
+    remembered = view.memory.memo.of(_TREES, dict)
     trees: dict[str, Mapping[str, str]] = {}
     for path, bags in _recordings_to_compare(view):
+        files = hash(tuple(bag.identity for bag in bags))
+        tree = remembered.get(path)
         try:
-            parents = remembered.get(path) or _static_parents(view, bags)
+            if tree is None or tree.files != files:
+                tree = _StaticTree(files, _static_parents(view, bags))
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
-            remembered[path] = parents
-        trees[path] = parents
+            remembered[path] = tree
+        trees[path] = tree.parents
     contradicting: set[str] = set()
     for (first, parents), (other, others) in combinations(trees.items(), 2):
         for frame in sorted(parents.keys() & others.keys() - contradicting):

@@ -13,6 +13,7 @@ from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.memories import asked, each_way, memory_of, with_store
 
 S = 10**9
@@ -264,6 +265,22 @@ def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
     memory = memory_of(tmp_path)
     (note,) = warned(memory)
     assert "laser is in base_link in the recording red, and in torso in blue" in note
+
+
+def test_a_recording_that_is_replaced_or_grows_is_compared_again(tmp_path: Path) -> None:
+    later = T0 + 3600 * S
+    clock = SettableClock(later + 600 * S)
+    record(tmp_path, "red", [mounted("base_link")])
+    record(tmp_path, "blue", [mounted("torso", later)])
+    memory = memory_of(tmp_path, clock=clock)
+    assert len(warned(memory)) == 1
+    (tmp_path / "blue" / "blue_0.mcap").unlink()
+    record(tmp_path, "blue", [mounted("base_link", later)])
+    clock.at += 300 * S
+    assert warned(memory) == []
+    write_mcap(tmp_path / "blue" / "blue_1.mcap", [mounted("torso", later + 60 * S)])
+    clock.at += 300 * S
+    assert len(warned(memory)) == 1
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3"])
