@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.history.context import Call, Latching, Memory
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.storage.base import Channel
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
 _UNHEARD_NS: Final[Ns] = 30 * NS_PER_S
@@ -386,13 +387,24 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
     bag = view.timeline.first_with(topic, type_name)
-    channels = view.memory.scanner.channels(view.timeline, bag) or view.bags.channels(bag)
-    reasons = [
+    stored = view.memory.scanner.channels(view.timeline, bag)
+    reasons = {*_reasons_of(view, stored, topic, type_name)}
+    # Other bags are stored, too, also deleted ones: if they differ in this, the bag itself is read.
+    if len(reasons) == 1:
+        return reasons.pop()
+    of_bag = _reasons_of(view, view.bags.channels(bag), topic, type_name)
+    return next(filter(None, reversed(of_bag)), None)
+
+
+def _reasons_of(
+    view: View, channels: Sequence[Channel], topic: str, type_name: str
+) -> list[str | None]:
+    """Returns for each channel of a topic and type why it cannot be decoded; None if it can."""
+    return [
         view.memory.reader.undecodable(channel)
         for channel in channels
         if channel.topic == topic and channel.type == type_name
     ]
-    return next(filter(None, reversed(reasons)), None)
 
 
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:

@@ -279,6 +279,20 @@ def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
 
 
 @each_way
+def test_what_cannot_be_decoded_is_judged_by_bags_that_are_there(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The first bag has the definition, the second one has not, and is then deleted."""
+    for n, layout in enumerate([McapLayout(), McapLayout(definitions=False)]):
+        seen = detections(T0 + n * 100 * S, ["cup"])
+        write_mcap(tmp_path / f"run{n}" / f"run{n}_0.mcap", [seen], layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert asked(memory, "data_time_range")["undecodable"] == []
+    (tmp_path / "run1" / "run1_0.mcap").unlink()
+    assert asked(memory, "data_time_range")["undecodable"] == []
+
+
+@each_way
 @pytest.mark.parametrize("damaged", [[4, 5, 6], [*range(1, 19)], [0, 19]])
 def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     tmp_path: Path, recalls: bool, damaged: list[int]
