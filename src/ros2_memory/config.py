@@ -217,7 +217,7 @@ MessageType: TypeAlias = Annotated[
 BelowBagDir: TypeAlias = Annotated[
     Text,
     _matching(
-        r"(?!/|(.*/)?\.\.(/|$)).*[^/. ].*",
+        r"\.|(?!/|(.*/)?\.\.(/|$)).*[^/. ].*",
         "be a path below recording.bag_dir, such as rec_20261120T043000Z",
     ),
 ]

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
+BAG_DIR_ITSELF: Final = "."
+"""Names the recording whose bags lie in the bag directory itself, if their names do not."""
 _BESIDE_OTHERS: Final[Key[dict[tuple[str, ...], dict[str, str]]]] = Key()
 """Of a timeline: `loose_bags_beside_others`, by the folders with a metadata.yaml."""
 
@@ -35,8 +37,10 @@ def paths_named(path: str) -> re.Pattern[str]:
     """Returns a pattern for the paths of a recording and of the files in it.
 
     `path` is a folder, a bag with or without its suffix, or a series of bags (`run` for
-    `run_0.mcap`, `run_1.mcap`).
+    `run_0.mcap`, `run_1.mcap`). `folder/.` has what lies in a folder itself.
     """
+    if path.endswith(f"/{BAG_DIR_ITSELF}"):
+        return re.compile(rf"{re.escape(path.removesuffix(BAG_DIR_ITSELF))}[^/]*", re.DOTALL)
     suffixes = "|".join(map(re.escape, BAG_KINDS))
     return re.compile(rf"{re.escape(path)}(?:/.*|(?:_\d+)?(?:{suffixes}))?", re.DOTALL)
 
@@ -76,9 +80,9 @@ def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:
     """
     if path != root:
         return path.removeprefix(f"{root}/")
-    # The bag directory itself is the recording: its bags name it.
-    name = stem_of(bags[0].file).removeprefix(f"{root}/")
-    return name if len(bags) == 1 else name.rpartition("_")[0]
+    # The bag directory itself is the recording: its bags name it if one name selects all of them.
+    series = {stem_of(bag.file) if len(bags) == 1 else _series_of(bag.file) for bag in bags}
+    return series.pop().removeprefix(f"{root}/") if len(series) == 1 else BAG_DIR_ITSELF
 
 
 def loose_bags(snapshot: Snapshot) -> dict[str, str]:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.config import load_settings
 from ros2_memory.core.spans import overlap_spans
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S
 from ros2_memory.history.context import Memory
@@ -70,6 +71,30 @@ def test_the_index_of_one_recording_finds_what_a_scan_of_it_finds(
     write(tmp_path, "run_2", at_s=51)
     (tmp_path / "a" / "a_0.mcap").unlink()
     assert comparable(part.refresh()) == comparable(index_of(tmp_path, name).refresh())
+
+
+@pytest.mark.parametrize(
+    ("bags", "name"),
+    [
+        (["run_0"], "run_0"),
+        (["run_0", "run_1"], "run"),
+        (["0", "1"], "."),
+        (["morning", "evening"], "."),
+        (["run_0", "run_1", "run_late"], "."),
+    ],
+)
+def test_a_bag_directory_that_is_a_recording_has_a_name_that_selects_it(
+    tmp_path: Path, bags: list[str], name: str
+) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+    for n, bag in enumerate([*bags, "other/other_0"]):
+        write(tmp_path, bag, at_s=n)
+    index = index_of(tmp_path)
+    own = recordings_of(index.refresh())[str(tmp_path)]
+    assert (name_of(str(tmp_path), own, str(tmp_path)), len(own)) == (name, len(bags))
+    assert [*index.alone(name).refresh().bags] == own
+    settings = load_settings([f"recording.bag_dir={tmp_path}", f"data.recording={name}"])
+    assert settings.data.recording == name
 
 
 def test_the_index_of_one_recording_has_no_other_than_that_which_it_is_made_of(
