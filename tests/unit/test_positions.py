@@ -281,3 +281,30 @@ def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
     [visit] = asked(memory, "visits", where=where, **first)["visits"]
     minutes = asked(memory, "compare", where=where, **first, **second)["minutes"]
     assert minutes["spot"] == {"this": pytest.approx(visit["duration_s"] / 60, abs=0.01), "with": 0}
+
+
+@pytest.mark.parametrize("names", [("den", "other"), ("other", "den")])
+def test_coordinates_and_a_place_of_one_name_are_two_rows(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(120)]
+    den = Place("den", "odom", Circle(9.0, 0.0, 1.0))
+    memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
+    both = {"den": {"x": 3.0, "y": 0.0, "radius_m": 1.0}, "other": "den"}
+    where = {name: both[name] for name in names}
+    compared = asked(
+        memory,
+        "compare",
+        where=where,
+        start=T0_S,
+        end=T0_S + 59,
+        with_start=T0_S + 60,
+        with_end=T0_S + 119,
+    )
+    third = pytest.approx(1 / 3, abs=0.01)
+    assert compared["minutes"] == {
+        "den": {"this": third, "with": 0},
+        "other": {"this": 0, "with": third},
+    }
+    rows = [row[0] for row in asked(memory, "visits", where=where, by="place")["rows"]]
+    assert [name for name in rows if name in both] == [*names]

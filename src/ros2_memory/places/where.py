@@ -135,7 +135,8 @@ def parse_where(
     places: list[Where] = []
     for name, place_value in several.items():
         place = _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}")
-        if place.name is None:
+        # Coordinates may have been given the name of a place that the settings have.
+        if place.name is None or isinstance(several.get(place.name), dict):
             place = replace(place, name=name)
         # Two spellings of one name are one place.
         if place not in places:
