@@ -529,6 +529,7 @@ class MemoryDays:
         path = self._writable_file(day)
         self.own.add_bags(self._folder, [path.name])
         self._replace_day(path, self._merged_by_hour(path, records), bags)
+        self._checked_for_minutes.discard(path)
 
     def _replace_day(self, path: Path, records: Iterator[Record], bags: Sequence[BagFile]) -> None:
         """Replaces the file of a day, and lists the bags that the day now stands for.

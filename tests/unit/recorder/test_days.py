@@ -812,6 +812,18 @@ def test_after_a_month_numbers_have_one_message_a_minute_once_and_again_with_wha
     assert after[battery_only] < topics_in(bag_dir)[battery_only] < before[battery_only]
 
 
+def test_a_recorder_thins_a_day_again_to_which_it_added_bags(bag_dir: Path) -> None:
+    splits(bag_dir, range(10))
+    now, days = T0 + MONTH_NS + 2 * NS_PER_DAY, days_of(bag_dir)
+    keep_all(bag_dir, days=days)
+    days.limit(now)
+    split(bag_dir, 600, name="rec_B")
+    keep_all(bag_dir, "rec_B", days=days)
+    added = topics_in(bag_dir)
+    days.limit(now)
+    assert topics_in(bag_dir)["/battery_state"] < added["/battery_state"]
+
+
 def test_a_day_that_a_full_disk_left_as_it_was_is_thinned_when_there_is_room(bag_dir: Path) -> None:
     splits(bag_dir, range(5))
     keep_all(bag_dir)
