@@ -28,7 +28,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import note_unread, recording_gaps
+from ros2_memory.history.coverage import note_unread, reached, recording_gaps
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View, open_view
@@ -211,14 +211,13 @@ def plot_recap(*, picture: Picture) -> None:
 
 
 def recorded_part(memory: Memory, window: TimeWindow) -> PlotWindow:
-    """Returns the part of a window between the first and the last recorded message.
+    """Returns the part of a window that the memory can show.
 
     Raises:
         NoDataError: nothing is recorded, or nothing in that window.
     """
     view = open_view(memory, Call(), window.stop)
-    recorded = TimeWindow(view.snapshot.earliest or 0, (view.snapshot.latest or 0) + 1)
-    part = window.intersect(recorded)
+    part = reached(view.snapshot, window)
     if part.empty:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing was recorded in this time")
     return PlotWindow(view, part)

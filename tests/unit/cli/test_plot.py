@@ -87,6 +87,16 @@ def test_each_is_a_picture_of_the_asked_kind(
     assert ET.parse(drawn).getroot().tag.endswith("svg")  # noqa: S314 - written just now
 
 
+def test_the_path_of_a_time_that_a_wrong_clock_gave_is_drawn(
+    tmp_path: Path, exits: Program
+) -> None:
+    for name, begin in (("rec", T0), ("unset", 1000 * S)):
+        poses = [odom(begin + n * S, n / 10, 0.0) for n in range(600)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
+    exits(0, f"plot path {tmp_path} --out {tmp_path}/x.svg --start 1000 --end 1600")
+    assert (tmp_path / "x.svg").is_file()
+
+
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
     signals, _ = plot.read_signals(whole_memory(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
