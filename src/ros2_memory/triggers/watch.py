@@ -182,6 +182,8 @@ class Triggers:
         except ValueError as error:
             problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
             _log.error("trigger_state_lost", reason=problem)
+        if state is not None:
+            state.searched = self._searched_by_part(state, snapshot)
         state = state or self._new_state(snapshot)
         state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
         for name, record in state.rules.items():
@@ -197,6 +199,21 @@ class Triggers:
         newest = {part: max(bag.end for bag in bags) for part, bags in closed.items()}
         searched = {part: end + 1 for part, end in newest.items() if recording_of(part) in live}
         return TriggerState(before=ended[-1] if ended else None, searched=searched)
+
+    def _searched_by_part(self, state: TriggerState, snapshot: Snapshot) -> dict[str, Ns]:
+        """Returns until which log time each part was searched.
+
+        Version 0.1.0 knew no parts: it stored how far it had searched a recording as a whole.
+        """
+        closed, _ = self._closed_bags(snapshot, state)
+        ends = {part: max(bag.end for bag in bags) for part, bags in closed.items()}
+        searched: dict[str, Ns] = {}
+        for name, until in state.searched.items():
+            searched[name] = until
+            if until > ends.get(name, until) + 1:
+                others = (part for part in ends if recording_of(part) == name != part)
+                searched |= {part: min(until, ends[part] + 1) for part in others}
+        return searched | state.searched
 
     def _check_topic(self, rule: Rule, record: RuleRecord) -> None:
         """Stores and logs whether a rule can never fire since its topic is not recorded."""

@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
-from ros2_memory.bag_dir.state_files import TRIGGERS
+from ros2_memory.bag_dir.state_files import TRIGGERS, TriggerState
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.triggers.rules import Rule
@@ -265,6 +265,21 @@ def test_what_happens_after_the_clock_was_set_back_fires_once(
         robot.look()
     robot.close_all()
     assert [(at - T0) // S for at in robot.fired_at()] == sorted([98, begin + 15, 131])
+
+
+def test_what_version_0_1_0_searched_after_the_clock_was_set_back_is_not_searched_again(
+    robot: WatchedBags,
+) -> None:
+    """It had searched a recording as a whole up to one log time."""
+    name = robot.begin(T0)
+    for begin in (0, 10, 5, 15):
+        robot.split(seconds(begin, begin + 10, {22}))
+    searched = TriggerState(searched={name: T0 + 25 * S})
+    TRIGGERS.write(robot.bag_dir, searched)
+    robot.house = robot.new_house()
+    robot.split(seconds(25, 35, {28}))
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 28 * S]
 
 
 def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
