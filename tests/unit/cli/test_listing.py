@@ -23,6 +23,7 @@ from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
+from ros2_memory.columns import database
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
@@ -222,6 +223,27 @@ def test_where_no_store_can_be_written_index_says_so(
     (tmp_path / OWN_FOLDER).write_text("a file where a folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
     assert "XDG_CACHE_HOME" in exits(2, "index").err
+
+
+def test_index_fails_if_the_store_cannot_be_written(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    for bag in folder.rglob("*.mcap"):
+        os.utime(bag, (1_700_000_000,) * 2)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+
+    def fill_the_disk(*_: object, **_how: object) -> None:
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise error
+
+    with monkeypatch.context() as full:
+        full.setattr(database, "_write_in_transaction", fill_the_disk)
+        failed = exits(2, "index --json")
+    assert failed.json["stored"] == 0
+    assert "the store of columns cannot be used: database or disk is full" in failed.err
+    assert exits(0, "index --json").json["stored"] > 0
 
 
 def test_no_text_commands_a_terminal_nor_a_reply_and_letters_that_it_has_not_are_spelled_out(

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import typer
 
@@ -75,12 +75,14 @@ def index(
     problems: list[str] = []
     for name in robots or ("",):
         try:
-            progress = _fill_for_people(settings, name, verbose=verbose)
+            progress, trouble = _fill_for_people(settings, name, verbose=verbose)
         except (ConfigError, RecorderError) as error:
             if not robots:
                 raise
             problems.append(f"{name}: {error}")
             continue
+        if trouble is not None:
+            problems.append(f"{name}: {trouble}" if robots else trouble)
         rows[name] = {
             "bags": progress.closed,
             "stored": progress.stored,
@@ -95,7 +97,14 @@ def index(
         raise RecorderError("; ".join(problems))
 
 
-def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progress:
+class _Filled(NamedTuple):
+    """How much is stored, and what is wrong with the store, or None."""
+
+    progress: Progress
+    trouble: str | None
+
+
+def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> _Filled:
     """Fills the store of a robot of the fleet; without a fleet the name is empty.
 
     Raises:
@@ -114,7 +123,9 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
             "set XDG_CACHE_HOME to a writable folder"
         )
     with spinner("storing columns") as show:
-        return _fill_and_close(backfill, lambda progress: show(describe_progress(progress)))
+        progress = _fill_and_close(backfill, lambda progress: show(describe_progress(progress)))
+    trouble = backfill.filling.store.trouble
+    return _Filled(progress, trouble and f"the store of columns {trouble}")
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
