@@ -399,9 +399,7 @@ class _LeafTest(NamedTuple):
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
         if lengths is None:
-            if has_short:
-                return
-            raise UnknownShapeError(f"{path} has no column")
+            raise UnknownShapeError(f"{path}.length has no column")
         is_long = lengths > (MAX_NUMBERS if has_short else 0)
         if not is_long.any():
             return

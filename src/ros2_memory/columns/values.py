@@ -266,11 +266,11 @@ class Values:
         return numbers.astype(np.float64, copy=False), error
 
     def holds_all(self, leaf: Leaf) -> bool:
-        """Returns whether each array that a leaf is an element of is short enough for a column."""
+        """Returns whether each array that a leaf is an element of surely has a column."""
         if not leaf.is_of_array or leaf.level.parent is None:
             return True
         lengths = self.numeric(leaf.level.parent, f"{leaf.level.name}.length")
-        return lengths is None or not (lengths > MAX_NUMBERS).any()
+        return lengths is not None and not (lengths > MAX_NUMBERS).any()
 
     def error(self, leaf: Leaf) -> float:
         """Returns the greatest error of the columns of a leaf, in their own unit."""

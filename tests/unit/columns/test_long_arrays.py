@@ -109,3 +109,20 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
         refused = ask(name="find_last_match", **{**elbow, "field": "positions.knee"})
         assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")
         assert "their fields are: positions." in refused["detail"]
+
+
+def test_long_arrays_beside_empty_ones_are_found_where_columns_were_dropped(
+    tmp_path: Path,
+) -> None:
+    names, random, messages = [*map("joint_{}".format, range(12))], Random(1), list[Msg]()
+    for nth in range(0, 40, 2):
+        angles = [random.uniform(0.6, 1.0) for _ in names]
+        messages += [joint_state(nth, names, angles), joint_state(nth + 1, ["gripper"], [])]
+    plain = remembered(tmp_path, messages)
+    asks = {"condition_type": "above", "value": 0.5, "field": "positions"}
+    window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40, "fields": ["positions"]}
+    for memory in (plain, with_store(plain, tmp_path, share=0.0)):
+        ask = partial(asked, memory, topic="/joints")
+        assert ask(name="find_last_match", **asks)["timestamp"] == T0 / NS_PER_S + 38
+        extremes = ask(name="get_topic_in_range", **window)["extremes"]
+        assert extremes["positions"]["max"] > 0.5
