@@ -10,7 +10,6 @@ Zones are looked at first, since they rule out tests without a column being unpa
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from itertools import compress
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -102,21 +101,23 @@ class ColumnCondition:
         whole = _any_of(tests, values)
         return TruthValues(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
 
-    def unstated(self, table: Table) -> Mask:
+    def unstated(self, table: Table) -> Mask | None:
         """Returns which rows say nothing of the field; see `Condition.is_unstated`.
 
-        Where the columns do not show it, a row counts as one that does.
+        None if the columns do not show it.
         """
         plan, values = self._plans.of(table), Values(table)
-        if plan is not None and plan.names is not None:
-            with suppress(UnknownShapeError):
-                names, owners = values.texts(plan.names), values.elements(plan.names.level).owners
-                counts = np.bincount(owners, minlength=values.rows)
-                is_asked = names.are(lambda word: word == plan.element)
-                asked = np.bincount(owners[is_asked], minlength=values.rows)
-                has_others_alone: Mask = (counts > 0) & (asked == 0)
-                return has_others_alone
-        return np.zeros(values.rows, np.bool_)
+        if plan is None or plan.names is None:
+            return np.zeros(values.rows, np.bool_)
+        try:
+            names, owners = values.texts(plan.names), values.elements(plan.names.level).owners
+        except UnknownShapeError:
+            return None
+        is_asked = names.are(lambda word: word == plan.element)
+        has_any, is_stated = np.zeros((2, values.rows), np.bool_)
+        has_any[owners] = is_stated[owners[is_asked]] = True
+        has_others_alone: Mask = has_any & ~is_stated
+        return has_others_alone
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns which parts may have a row that meets the condition, by their zones.

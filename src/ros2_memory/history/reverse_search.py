@@ -353,8 +353,21 @@ class RowCondition:
         return self._test.may_match(parts)
 
     def unstated(self, rows: Rows) -> Mask:
-        """Returns which rows of a table lack the field, as far as columns show it."""
-        return self._test.unstated(rows.table)
+        """Returns which rows of the table lack the field; of rows that count alone, if decoded.
+
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        unstated = self._test.unstated(rows.table)
+        if unstated is not None:
+            return unstated
+        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        unstated = np.zeros(len(rows.table), np.bool_)
+        for positions, decoded in decoded_rows(self._view, rows):
+            of_bag = self._test.unstated(decoded.table)
+            if of_bag is not None:
+                unstated[index[positions]] = of_bag[decoded.index]
+        return unstated
 
     def truth(self, rows: Rows) -> TruthValues:
         """Returns which rows of the table meet the condition.

@@ -126,3 +126,18 @@ def test_long_arrays_beside_empty_ones_are_found_where_columns_were_dropped(
         assert ask(name="find_last_match", **asks)["timestamp"] == T0 / NS_PER_S + 38
         extremes = ask(name="get_topic_in_range", **window)["extremes"]
         assert extremes["positions"]["max"] > 0.5
+
+
+def test_joints_that_others_publish_between_end_no_sighting_where_columns_were_dropped(
+    tmp_path: Path,
+) -> None:
+    random, messages = Random(1), list[Msg]()
+    for nth in range(0, 80, 2):
+        arm, gripper = [random.uniform(0.6, 1.0), random.random()], [random.random()]
+        messages += [joint_state(nth, ["elbow", "wrist"], arm)]
+        messages += [joint_state(nth + 1, ["gripper"], gripper)]
+    plain = remembered(tmp_path, messages)
+    bent = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
+    for memory in (plain, with_store(plain, tmp_path, share=0.0)):
+        [bending] = asked(memory, "find_matches", topic="/joints", **bent)["sightings"]
+        assert bending["count"] == 40
