@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import IntArray, Mask
 
 Pair = tuple[str, str]
 
@@ -85,17 +86,28 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
     transforms = _transforms_of(table)
     if transforms is None:
         return None
-    if index is None and _has_valid_numbers(table):
-        pairs, _ = _coded_pairs(transforms)
-        return frozenset(pairs)
+    if index is None and _has_finite_numbers(table):
+        pairs, codes = _coded_pairs(transforms)
+        counts = np.bincount(codes[_are_rotations(transforms)] + 1, minlength=len(pairs) + 1)
+        return frozenset(compress(pairs, counts[1:]))
     times = np.zeros(len(table) if index is None else index.size, np.int64)
     return frozenset(_edges_of(transforms, times, index))
 
 
-def _has_valid_numbers(table: Table) -> bool:
+def _has_finite_numbers(table: Table) -> bool:
     """Returns whether the numbers of all transforms are finite, by the zones of their columns."""
     zones = [table.zone(f"{_LIST}.{path}") for path in (*_TRANSLATION, *_ROTATION)]
     return all(zone and not zone.nulls and math.isfinite(zone.high - zone.low) for zone in zones)
+
+
+def _are_rotations(transforms: Elements) -> Mask:
+    """Returns which transforms have a quaternion that is not zero, as far as it is stored."""
+    are_rotations = np.zeros(len(transforms), np.bool_)
+    for part in reversed(_ROTATION):  # mostly w tells
+        are_rotations |= _rounded_rows(transforms, (part,), QUATERNION)[:, 0] != 0
+        if are_rotations.all():
+            break
+    return are_rotations
 
 
 def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:

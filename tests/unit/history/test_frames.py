@@ -242,6 +242,18 @@ def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     assert "ask about then" not in refused["detail"]
 
 
+@each_way
+def test_a_frame_that_no_rotation_places_is_none(tmp_path: Path, recalls: bool) -> None:
+    """As tf2 refuses a quaternion that nobody filled in."""
+    unfilled: Any = transform(T0, "base_link", "laser", (1.0, 0.0, 0.0))
+    unfilled.transform.rotation.w = 0.0
+    static = tf(T0, unfilled, topic="/tf_static")
+    record(tmp_path / "one", [static, *moving(T0, 20, "odom", "base_link", 0.0, 0.0)])
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert asked(memory, "list_frames")["frames"] == ["base_link", "odom"]
+    assert "ask about then" not in looked_up(memory, T0 + 5 * S, "base_link", "laser")["detail"]
+
+
 @settings(max_examples=examples(30))
 @given(
     received=st.lists(
