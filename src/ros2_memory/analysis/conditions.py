@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
-from ros2_memory.messages.conversions import INDEX, Summary, names_beside
+from ros2_memory.messages.conversions import INDEX, Summary, names_beside, names_others
 from ros2_memory.messages.detections import detections_of, without_low_scores
 
 if TYPE_CHECKING:
@@ -249,8 +249,7 @@ class Condition:
 
     def is_unstated(self, value: JsonValue) -> bool:
         """Returns whether a value names elements (joints), but not the one that is asked for."""
-        names = names_beside(value, self.field or "")
-        return bool(names) and self.element not in names
+        return names_others(value, self.field or "")
 
     @property
     def element(self) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import Summary
+from ros2_memory.messages.conversions import Summary, names_others
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 TEXT: Final = "std_msgs/msg/String"
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
+_MOST_TRIED: Final = 200
+"""At most this many messages are read to find one that says something of the field."""
 _MOST_CHARS: Final = 16 << 20
 """The most characters of values (as JSON text) that a call may hold in memory."""
 
@@ -107,7 +109,8 @@ class HeldValues:
         known: the values that `during` has found, newest first, also if time was over.
 
     Raises:
-        InvalidArgumentsError: the newest message before `until` has no single value there.
+        InvalidArgumentsError: the newest message before `until` that says something of the field
+            has no single value there.
     """
 
     def __init__(
@@ -130,11 +133,18 @@ class HeldValues:
         self._require_single_value(asked, until)
 
     def _require_single_value(self, asked: str, until: Ns) -> None:
-        newest = self._view.stream.last(self._topic, until)
-        message = None if newest is None else self._view.bags.decode(newest)
-        if newest is None or message is None:
-            return
-        if isinstance(self._value_of(message, newest.type), list | dict | None):
+        newest: StoredMessage | None = None
+        value: JsonValue = None
+        window = TimeWindow(MIN_NS, until)
+        messages = self._view.stream.messages([self._topic], window, newest_first=True)
+        for newest in islice(messages, _MOST_TRIED):
+            message = self._view.bags.decode(newest)
+            if message is None:
+                return
+            value = self._value_of(message, newest.type)
+            if not self._is_unstated(value, message, newest.type):
+                break
+        if newest is not None and isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             raise InvalidArgumentsError(
                 f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "
@@ -268,9 +278,11 @@ class HeldValues:
         for stored in self._view.stream.messages([self._topic], part, newest_first=newest_first):
             self._check(stored.time)
             message = self._view.bags.decode(stored)
-            if message is not None:
-                word = json.dumps(self._value_of(message, stored.type))
-                yield _Run(word, stored.time, stored.time)
+            if message is None:
+                continue
+            value = self._value_of(message, stored.type)
+            if not self._is_unstated(value, message, stored.type):
+                yield _Run(json.dumps(value), stored.time, stored.time)
 
     def _value_of(self, message: object, type_name: str) -> JsonValue:
         """Returns the value in a message; an object with one key stands for its value."""
@@ -284,6 +296,12 @@ class HeldValues:
         if isinstance(value, dict) and len(value) == 1 and not isinstance(value, Summary):
             [value] = value.values()
         return _canonical(value)
+
+    def _is_unstated(self, value: JsonValue, message: object, type_name: str) -> bool:
+        """Whether a message says nothing of the field: it names other elements (joints) alone."""
+        if value is not None or self._field is None:
+            return False
+        return names_others(self._view.extractor.exact(message, type_name), self._field)
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""

@@ -149,6 +149,12 @@ def names_beside(value: object, dot_path: str) -> list[object]:
     return []
 
 
+def names_others(value: object, dot_path: str) -> bool:
+    """Returns whether a value names elements (joints), but not the one that a path asks for."""
+    names, (_, _, name) = names_beside(value, dot_path), dot_path.partition(".")
+    return bool(names) and name not in names
+
+
 def _descend_each(
     nodes: Sequence[object] | Array,
     segments: Sequence[str],

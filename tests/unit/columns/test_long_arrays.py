@@ -141,3 +141,19 @@ def test_joints_that_others_publish_between_end_no_sighting_where_columns_were_d
     for memory in (plain, with_store(plain, tmp_path, share=0.0)):
         [bending] = asked(memory, "find_matches", topic="/joints", **bent)["sightings"]
         assert bending["count"] == 40
+
+
+@each_way
+def test_a_joint_holds_its_value_while_another_publisher_names_others(
+    tmp_path: Path, recalls: bool
+) -> None:
+    messages = list[Msg]()
+    for nth in range(0, 12, 2):
+        messages += [joint_state(nth, ["lift"], [0.5 * (nth >= 6)])]
+        messages += [joint_state(nth + 1, ["elbow", "wrist"], [0.1 * nth, 0.0])]
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    window = {"topic": "/joints", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 11}
+    lift = partial(asked, memory, "get_topic_in_range", **window, fields=["positions.lift"])
+    held = [(row["seconds"], row["value"]) for row in lift(changes=True)["changes"]]
+    assert held == [(6.0, 0), (4.0, 0.5)]
+    assert [row[:3] for row in lift(by="value")["rows"]] == [["0", 1, 6.0], ["0.5", 1, 4.0]]
