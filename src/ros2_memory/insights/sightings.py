@@ -327,8 +327,11 @@ def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope)
             view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=False
         )
         is_full = len(found.episodes) == MOST_COUNTED
+        start = scope.window.start
         return SightingSpans(
-            held_spans((episode.first, episode.until, True) for episode in found.episodes),
+            held_spans(
+                (episode.first, episode.until, episode.first >= start) for episode in found.episodes
+            ),
             found.since,
             f"more than {MOST_COUNTED:,} episodes" if is_full else "",
         )

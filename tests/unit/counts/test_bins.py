@@ -186,6 +186,21 @@ def test_the_first_of_a_day_is_not_known_where_the_window_begins_after_others(
     assert usual_first(15) == ("08:00:10", "09:00:10", 2)
 
 
+def test_an_episode_of_the_evening_before_is_not_the_first_of_a_day(tmp_path: Path) -> None:
+    midnight = round(datetime(2026, 3, 2).astimezone().timestamp())
+    said = ((22, "charge"), (30, ""), (33, "mow"), (35, ""), (46, "charge"), (54, ""))
+    messages = [text((midnight + hour * H) * S, word, "/task") for hour, word in said]
+    messages += [odom((midnight + at) * S) for at in range(20 * H, 55 * H, 60)]
+    memory = remembered(tmp_path, messages)
+    asks = {"topic": "/task", "condition_type": "equals", "value": "charge", "by": "day"}
+    span = {"start": midnight + 24 * H, "end": midnight + 48 * H}
+    reply = asked(memory, "find_matches", **asks, **span)
+    day = table(reply)["2026-03-03"]
+    assert (day["count"], day["seconds"]) == (1, 8 * H)
+    assert day["first_unix"] == midnight + 46 * H
+    assert reply["usual_first"]["earliest"] == reply["usual_first"]["latest"] == "22:00:00"
+
+
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
 
