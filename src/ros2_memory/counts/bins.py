@@ -390,10 +390,11 @@ class BinnedWindow:
         begins = starts[begun[inside] > 0]
         self.add_counts("count", begins)
         is_long = starts < stops
-        lasting = united(spans_of(starts[is_long], stops[is_long]))
-        self.add_lengths("seconds", "duration", without(lasting, self.gaps))
+        lasting = without(united(spans_of(starts[is_long], stops[is_long])), self.gaps)
+        self.add_lengths("seconds", "duration", lasting)
         self.add_first("first", begins)
-        self.add_last(self._last_held(starts, stops), max(stops.tolist(), default=None))
+        known = [*lasting, *spans_of(starts[~is_long], stops[~is_long])]
+        self.add_last(self._last_held(*bounds_of(known)), max(stops.tolist(), default=None))
         self.usual = self.usual_of(begins)
 
     def add_first(self, column: str, times: Ints) -> None:
@@ -412,6 +413,7 @@ class BinnedWindow:
     def _last_held(self, starts: Ints, stops: Ints) -> Ints:
         """Returns the last time in each piece that lies in a span (inclusive); else `MIN_NS`."""
         piece_ends = self.bins.edges[1:] - 1
+        piece_ends[-1] += 1  # the window's end is in the last piece
         first_pieces, last_pieces = self.bins.pieces(starts), self.bins.pieces(stops)
         newest = np.full(len(piece_ends), MIN_NS)
         np.maximum.at(newest, last_pieces, np.minimum(stops, piece_ends[last_pieces]))

@@ -201,6 +201,25 @@ def test_an_episode_of_the_evening_before_is_not_the_first_of_a_day(tmp_path: Pa
     assert reply["usual_first"]["earliest"] == reply["usual_first"]["latest"] == "22:00:00"
 
 
+def test_a_text_that_holds_through_a_gap_has_no_row_for_hours_without_recording(
+    tmp_path: Path,
+) -> None:
+    begin = round(datetime(2026, 3, 2, 8).astimezone().timestamp())
+    said = {0: "", 600: "nap"}
+    for number, recorded in enumerate((range(H), range(3 * H, 4 * H + 1))):
+        messages = [odom((begin + at) * S) for at in recorded]
+        texts = [text((begin + at) * S, said[at], "/task") for at in recorded if at in said]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [*texts, *messages])
+    asks = {"topic": "/task", "condition_type": "equals", "value": "nap", "by": "hour"}
+    reply = asked(memory_of(tmp_path), "find_matches", start=begin, end=begin + 4 * H, **asks)
+    rows = table(reply)
+    assert [*rows] == ["08:00", "11:00", "all"]
+    assert rows["08:00"]["last"] == "2026-03-02 08:59:59"
+    assert rows["08:00"]["last_unix"] == begin + H - 1
+    assert rows["11:00"]["last"] == rows["all"]["last"] == "2026-03-02 12:00:00"
+    assert "no rows for times in which nothing was recorded: 09:00 to 10:00" in reply["notes"]
+
+
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
 
