@@ -53,7 +53,6 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.held_values import (
     HeldValue,
     HeldValues,
-    held_at,
     held_until,
     holds_on,
     is_latched,
@@ -65,7 +64,7 @@ from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
-from ros2_memory.insights.topic_events import events_back, flags_before, is_unbroken
+from ros2_memory.insights.topic_events import events_back, flags_before, message_before
 from ros2_memory.places.where import Scope, Where, WhileCondition, heard_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
@@ -314,15 +313,12 @@ def _flag_spans(
 
     `before` is whether it held when the window began, or None if no earlier message says so.
     """
-    start, end = binned.counted.asked()
     events = joined_events([part.without_sights() for part in parts])
     states = _flag_states(binned, topic, events, condition, before, wanted=wanted)
     if states is None:
         return None
-    last = start if events is None else events.last
-    is_holding = holds_on(binned.view, [topic])
-    if events is not None or is_holding:
-        end = held_until(binned.view, topic, last, max(last, end), through_silences=is_holding)
+    last = binned.window.start if events is None else events.last
+    end = held_until(binned.view, topic, last, max(last, binned.window.stop), or_rare=True)
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
     gaps = _gaps_for_topic(binned, topic)
     spans: list[_HeldSpan] = []
@@ -370,13 +366,8 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
 
     None if it said nothing before that still held then.
     """
-    view = binned.view
-    start, _ = binned.counted.asked()
-    held = held_at(view, topic, start)
-    if held is None and not is_latched(view, topic) and holds_on(view, [topic]):
-        newest = view.stream.last(topic, start)
-        if newest is not None and is_unbroken(view, topic, newest.time, start):
-            held = newest
+    view, (start, _) = binned.view, binned.counted.asked()
+    held = message_before(view, topic, start) if holds_on(view, [topic]) else None
     value = None if held is None else view.value(held)
     return None if value is None else condition.matches(value)
 
@@ -388,11 +379,11 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     firsts, lasts = binned.bounds([topic])
     order = np.argsort(lasts)
     begins, ends = bounds_of(binned.gaps)
-    # The topic is heard again in the bags that end after the gap. If one of them begins before the
-    # gap, it is not prolonged.
+    # The topic is heard again in the bags that end after the gap, if there are any. If one of them
+    # begins before the gap, the gap is not prolonged.
     following = np.searchsorted(lasts[order], ends)
     earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
-    heard_again = np.append(earliest, binned.counted.stop)[following].clip(ends)
+    heard_again = np.append(earliest, MAX_NS)[following].clip(ends)
     return spans_of(begins, heard_again)
 
 

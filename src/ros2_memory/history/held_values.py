@@ -384,14 +384,14 @@ def is_text(view: View, topic: str) -> bool:
     return set(view.timeline.types_of(topic)) == {TEXT}
 
 
-def held_until(view: View, topic: str, last: Ns, end: Ns, *, through_silences: bool = False) -> Ns:
+def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = False) -> Ns:
     """Returns until when the message of a topic at `last` held (log time, ns), at most `end`.
 
-    On a latched topic, or `through_silences`, it holds until the next message, or as far as
-    something is recorded. On another topic it holds until the next message if that comes within
+    On a latched topic, and with `or_rare` on a rare one, it holds until the next message, or as far
+    as something is recorded. On another topic it holds until the next message if that comes within
     `SILENCE_NS`, else it does not hold after `last`.
     """
-    if through_silences or is_latched(view, topic):
+    if is_latched(view, topic) or (or_rare and holds_on(view, [topic])):
         ends = [end, view.snapshot.latest or end]
         ends += [moment for moment in breaks_of(view, topic) if moment >= last]
         following = view.stream.first([topic], TimeWindow(last + 1, end + 1))

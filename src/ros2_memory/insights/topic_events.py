@@ -72,20 +72,27 @@ def toggle_sentence(topic: str, toggle: Change) -> str:
     return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
 
 
+def message_before(view: View, topic: str, first: Ns) -> StoredMessage | None:
+    """Returns the message before a log time (ns); None if one may be missing in between."""
+    if is_latched(view, topic):
+        return held_at(view, topic, first)
+    message = view.stream.last(topic, first)
+    is_last = message is not None and _is_unbroken(view, topic, message.time, first)
+    return message if is_last else None
+
+
 def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
     """Returns the booleans in the message before a log time (ns), by their names.
 
     Empty if a message may be missing in between: the booleans may have toggled there.
     """
-    holds_on = is_latched(view, topic)
-    message = held_at(view, topic, first) if holds_on else view.stream.last(topic, first)
-    if message is None or not (holds_on or is_unbroken(view, topic, message.time, first)):
-        return {}
-    flags, _ = (events_of_messages(view, [message]) or TopicEvents(1, 0)).of_kind(FLAG)
+    message = message_before(view, topic, first)
+    messages = [] if message is None else [message]
+    flags, _ = (events_of_messages(view, messages) or TopicEvents(1, 0)).of_kind(FLAG)
     return {flag.name: bool(flag.last) for flag in flags}
 
 
-def is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
+def _is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
     """Returns whether no message of a topic can be missing between two log times (ns)."""
     between = TimeWindow(before, first)
     is_broken = any(between.contains(at) for at in breaks_of(view, topic))
@@ -346,7 +353,7 @@ def _listed_before(
         return {}, False
     goals, _ = earlier.of_kind(GOAL)
     is_whole = not (earlier.beyond or earlier.undecodable)
-    is_all = is_whole and is_unbroken(view, topic, message.time, events.first)
+    is_all = is_whole and _is_unbroken(view, topic, message.time, events.first)
     return {goal.name: goal.last for goal in goals}, is_all
 
 

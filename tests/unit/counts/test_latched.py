@@ -104,6 +104,24 @@ def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message
     assert table(counted)["all"]["count"] == began
 
 
+@each_way
+@pytest.mark.parametrize(
+    ("first", "last", "held", "began"),
+    [(0, 3000, 2249, 2), (100, 900, 600, 1), (100, 500, 400, 0), (700, 3000, 1699, 1)],
+)
+def test_a_boolean_that_is_said_when_it_changes_holds_from_before_the_window_and_to_its_end(
+    tmp_path: Path, first: int, last: int, held: int, began: int, recalls: bool
+) -> None:
+    """True from 50 s on and from 800 s on; after the pause from 2499 s on it is not known."""
+    said = ((10, False), (50, True), (600, False), (800, True))
+    for number, recorded in enumerate((range(2500), range(2600, 3001))):
+        messages = [boolean(T0 + at * S, value, DOCKED) for at, value in said if at in recorded]
+        messages += [odom(T0 + at * S, 0.0, 0.0) for at in recorded]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    whole = table(matches(tmp_path, DOCKED, first, last, by="day", recalls=recalls))["all"]
+    assert (whole["seconds"], whole["count"]) == (held, began)
+
+
 @pytest.mark.parametrize(("split_s", "recalls"), [(10, False), (30, True), (600, True)])
 def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     tmp_path: Path, split_s: int, recalls: bool
