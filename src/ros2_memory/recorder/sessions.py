@@ -151,7 +151,8 @@ class Splits:
         with os.scandir(self.directory) as entries:
             for entry in entries:
                 if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
-                    sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
+                    with suppress(FileNotFoundError):  # retention has just deleted it
+                        sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
         return sizes
 
     def _find_closed(self, names: Iterable[str]) -> tuple[list[str], dict[str, str]]:

@@ -3,7 +3,10 @@
 No process runs, no second is waited for.
 """
 
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -262,6 +265,29 @@ def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
     assert len(world.logged(4, "recording_vanished")) == 1
     assert [recorder.status for recorder in world.recorders] == [0, None]
     assert world.supervisor.is_recording
+
+
+def test_a_split_that_is_deleted_while_its_folder_is_read_is_no_missing_folder(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Retention runs in another thread."""
+    world.run(30)
+    directory, scandir = world.recorders[0].directory, os.scandir
+    first, *_, newest = sorted(directory.glob("*.mcap"))
+
+    @contextmanager
+    def listed_before(path: Path) -> Iterator[Iterator[os.DirEntry[str]]]:
+        with scandir(path) as entries:
+            found = [*entries]
+        if path == directory:
+            first.unlink(missing_ok=True)
+        yield iter(found)
+
+    monkeypatch.setattr(os, "scandir", listed_before)
+    assert world.logged(4, "recording_vanished") == []
+    assert not first.exists()
+    assert newest.exists()
+    assert [recorder.status for recorder in world.recorders] == [None]
 
 
 @pytest.mark.parametrize("loser", ["old", "new"])
