@@ -31,10 +31,23 @@ from ros2_memory.bag_dir.json_files import until_changed
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
-from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
+from ros2_memory.core.errors import (
+    BagContradictionError,
+    BagError,
+    BagUnreachableError,
+    BagVanishedError,
+)
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
-from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record
+from ros2_memory.storage.base import (
+    BagReader,
+    Batch,
+    Channel,
+    Closing,
+    Definition,
+    Record,
+    errors_as_items,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -250,26 +263,49 @@ class BagDirReader(BagReader):
             excluded = [span.intersect(exclusion.logged) for exclusion in rule.exclusions]
             spans = united((window.start, window.stop) for window in excluded)
             windows = [TimeWindow(start, stop) for start, stop in spans]
-        lost = 0
+        uncounted = 0
         for window in windows:
-            for record in self.reader.records(path, [topic.topic], window):
-                if record.channel.type == topic.type and not rule.counts(record):
-                    lost += 1
-        if not lost:
+            for record in _with_losses(self.reader.records(path, [topic.topic], window)):
+                if isinstance(record, Record) and record.channel.type == topic.type:
+                    uncounted += not rule.counts(record)
+        if not uncounted:
             return topic
         first = self._end_of(path, topic, newest_first=False)
         last = self._end_of(path, topic, newest_first=True)
         if first is None or last is None:
             return None
-        return replace(topic, count=topic.count - lost, first=first, last=last)
+        return replace(topic, count=topic.count - uncounted, first=first, last=last)
 
     def _end_of(self, path: Path, topic: TopicSummary, *, newest_first: bool) -> Ns | None:
-        """Returns the log time (ns) of the topic's first or last message that counts, if any."""
+        """Returns the log time (ns) of the topic's first or last message that counts, if any.
+
+        Messages that cannot be read may count.
+        """
         span = TimeWindow(topic.first, topic.last + 1)
-        for record in self.records(path, [topic.topic], span, newest_first=newest_first):
+        records = self.records(path, [topic.topic], span, newest_first=newest_first)
+        for record in _with_losses(records):
+            if isinstance(record, TimeWindow):
+                lost = record.intersect(span)
+                return lost.stop - 1 if newest_first else lost.start
             if record.channel.type == topic.type:
                 return record.log_time
         return None
+
+
+def _with_losses(records: Iterator[Record]) -> Iterator[Record | TimeWindow]:
+    """Yields the messages, and the window of those that cannot be read.
+
+    Raises:
+        BagError: the file cannot be read.
+    """
+    for record in errors_as_items(records):
+        if isinstance(record, Record):
+            yield record
+        elif record.lost is None:
+            raise record
+        elif not isinstance(record, BagContradictionError):  # nothing is lost
+            first, last = record.lost
+            yield TimeWindow(first, last + 1)
 
 
 def _counted_batch(rule: FileRule, batch: Batch) -> Batch:

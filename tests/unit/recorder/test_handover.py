@@ -39,6 +39,8 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.handovers import recover_handovers
+from tests.support.mcap_surgery import spoil_chunk
+from tests.support.memories import asked, memory_of
 from tests.support.simulated_recorders import World
 
 S = 10**9
@@ -300,6 +302,26 @@ def test_the_newest_closed_split_is_the_last_of_those_that_retention_did_not_del
     assert splits.newest_closed() == tmp_path / "a_10.mcap"
     (tmp_path / "a_10.mcap").unlink()
     assert splits.newest_closed() == tmp_path / "a_9.mcap"
+
+
+@pytest.mark.parametrize("spoiled", [0, 1, -1])
+def test_of_a_file_with_a_damaged_chunk_the_cut_leaves_all_other_messages(
+    tmp_path: Path, spoiled: int
+) -> None:
+    for name, numbered in (("a", range(100)), ("b", range(60, 300))):
+        messages = [text(T0 + n * S // 10, str(n), "/fast") for n in numbered]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages, McapLayout(chunk_size=400))
+    hand_over(tmp_path, 7)
+    spoil_chunk(tmp_path / "b" / "b_0.mcap", spoiled)
+    memory = memory_of(tmp_path, reader=BagDirReader(McapReader(), tmp_path))
+    covered = asked(memory, "data_time_range")
+    assert covered["damaged"] == []
+    assert [covered["earliest"], covered["latest"]] == [T0 / S, pytest.approx(T0 / S + 29.9)]
+    search = {"topic": "/fast", "condition_type": "contains"}
+    reply = asked(memory, "find_last_match", **search, value="250")
+    assert reply["timestamp"] == pytest.approx(T0 / S + 25)
+    reply = asked(memory, "find_last_match", **search, value="nothing")
+    assert "b/b_0.mcap" in "".join(reply["notes"])
 
 
 def test_where_too_many_would_be_listed_all_count(
