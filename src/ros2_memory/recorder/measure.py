@@ -387,7 +387,7 @@ def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
 
 
 SPLIT_BYTES: Final = 64 * 2**20
-"""Only the end of a larger split is measured, and no holes, to spare the processor."""
+"""Only the end of a larger split is read, and no holes are sought, to spare the processor."""
 TAIL_NS: Final[Ns] = 4 * NS_PER_S
 """The length of that end."""
 _HOLD_NS: Final[Ns] = ns_from_unix(HOLD_S)
@@ -434,9 +434,9 @@ class SplitMeasure(NamedTuple):
     """How the topics of one split arrived.
 
     Attributes:
-        flows: topics whose offered QoS the split states.
+        flows: topics whose offered QoS the split states, and that have a message in what was read.
         progress: topics with one publisher, whose messages have a counter or a stamp.
-        arrivals: all topics that have a message.
+        arrivals: all topics that have a message; pauses are those in what was read.
     """
 
     flows: dict[str, TopicFlow]
@@ -462,7 +462,8 @@ class _Messages:
     value_reader: ValueReader | None = None
     published: list[Ns] = field(default_factory=list)
     largest: int = 0
-    arrival: Arrival | None = None
+    last: Ns = MAX_NS
+    pause: Ns = 0
     positions: list[Position] = field(default_factory=list)
 
     def add_channel(self, channel: Channel) -> None:
@@ -474,8 +475,7 @@ class _Messages:
         logged = record.log_time
         self.published.append(record.publish_time or logged)
         self.largest = max(self.largest, len(record.payload))
-        arrival = Arrival(logged, logged)
-        self.arrival = arrival if self.arrival is None else self.arrival.joined(arrival)
+        self.pause, self.last = max(self.pause, logged - self.last), logged
         if self.value_reader is not None:
             try:
                 value = self.value_reader.value_of(record.payload)
@@ -488,7 +488,7 @@ class _Messages:
 def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> SplitMeasure:
     """Returns how each topic of a closed split arrived.
 
-    `end_only` measures only the last seconds of a small split, too, and no holes.
+    `end_only` reads only the last seconds of a small split, too, and seeks no holes.
 
     Raises:
         BagError: the split cannot be read.
@@ -497,19 +497,20 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
     topics: defaultdict[str, _Messages] = defaultdict(_Messages)
     for channel in reader.channels(path):
         topics[channel.topic].add_channel(channel)
-    window = TimeWindow.everything()
+    window, summary = TimeWindow.everything(), reader.summarize(path)
     is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
-    if not is_whole and not (summary := reader.summarize(path)).empty:
+    if not is_whole and not summary.empty:
         window = TimeWindow.before(summary.end, TAIL_NS)
     for record in reader.records(path, [*topics], window):
         topics[record.channel.topic].add(record)
     split = SplitMeasure({}, {}, {})
+    for total in summary.topics:
+        arrival = Arrival(total.first, total.last, total.count, topics[total.topic].pause)
+        known = split.arrivals.get(total.topic)  # of another type
+        split.arrivals[total.topic] = arrival if known is None else known.joined(arrival)
     for topic, messages in topics.items():
-        if messages.arrival is None:
-            continue
-        split.arrivals[topic] = messages.arrival
         offered = offered_by_all(messages.offered_texts)
-        if offered is None:
+        if offered is None or not messages.published:
             continue
         burst = largest_burst(messages.published)
         split.flows[topic] = TopicFlow(offered, burst, messages.largest)

@@ -388,7 +388,6 @@ class Reception:
         """Measures a split; without a recording it is of an earlier run."""
         try:
             split = measure_split(self.reader, path, end_only=not recording)
-            summary = self.reader.summarize(path)
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; the next split shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
@@ -403,8 +402,7 @@ class Reception:
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())
             if state is not None and split.arrivals:
-                # Not `split.start`: only the end of a large split is measured.
-                self._add_refused(state, summary.start, split.end)
+                self._add_refused(state, split.start, split.end)
             if recording:
                 self._arrivals.add_split(split)
                 losses = self._losses.add_split(recording, split.progress)

@@ -41,7 +41,7 @@ from ros2_memory.recorder.reception import (
 )
 from ros2_memory.storage.base import Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.simulated_recorders import Inline
 
 NS = 10**9
@@ -209,7 +209,7 @@ def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
     assert len(read_losses(tmp_path, MIN_NS, MAX_NS)) == 2
 
 
-def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
+def test_of_a_huge_split_the_end_shows_bursts_and_no_holes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = split(tmp_path / "a_0.mcap", 50, 10)
@@ -219,7 +219,28 @@ def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
     tail = measure_split(McapReader(), path)
     assert tail.flows == whole.flows
     assert tail.progress == {}
-    assert tail.end - tail.start <= measure.TAIL_NS
+
+
+@pytest.mark.parametrize("seconds", [10, 20])
+def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int
+) -> None:
+    monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
+    made = reception(tmp_path)
+    made.overrides("a")
+    for number in range(4):
+        at = T0 + number * seconds * NS
+        odometry = [odom(at + tick * NS // 20, 1.0, 2.0) for tick in range(20 * seconds)]
+        seldom = text(at + NS, "early in its split")
+        path = tmp_path / f"a_{number}.mcap"
+        made.learn("a", write_mcap(path, [*odometry[:20], seldom, *odometry[20:]]))
+    silent, rates_hz = made.arrivals(0)
+    assert (silent, rates_hz) == (
+        set(),
+        {"/odom": pytest.approx(20, rel=0.01), "/chatter": pytest.approx(1 / seconds, rel=0.01)},
+    )
+    silent, _ = made.arrivals(11 * NS)
+    assert silent == {"/odom"}
 
 
 def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
