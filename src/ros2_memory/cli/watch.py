@@ -27,7 +27,7 @@ from ros2_memory.insights.status import memory_status, usual_rate
 from ros2_memory.results import Status
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
-"""Current rates are those of the newest data of this length."""
+"""Current rates are those of the newest data of this length, since the newest recording began."""
 AS_USUAL: Final = "as usual"
 LIVE_SPLITS: Final = 3
 LIVE_NS: Final[Ns] = 60 * NS_PER_S
@@ -106,7 +106,9 @@ def _rates(
     There is no usual rate for logs, for a topic whose newest messages were deleted by request, and
     if some of the newest time was excluded.
     """
-    window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
+    begun = max((stop for _, stop in snapshot.breaks), default=snapshot.dating.earliest or latest)
+    length = min(max(latest - begun, NS_PER_S), WINDOW_NS)
+    window, window_s = TimeWindow(latest - length + 1, latest + 1), unix_from_ns(length)
     timeline, latching = snapshot.timeline, memory.limits.latching
     bag_dir, view = memory.index.bag_dir, View(memory, Call())
     is_excluded = bool(excluded_spans(bag_dir, window))
@@ -120,26 +122,25 @@ def _rates(
         usual = usual_rate(snapshot, topic, latching)
         if timeline.is_log(topic) or is_cut or is_excluded:
             usual = None
-        age_s, rate = max(unix_from_ns(latest - last), 0.0), int(count) / unix_from_ns(WINDOW_NS)
+        age_s, rate = max(unix_from_ns(latest - last), 0.0), int(count) / window_s
         yield {
             "topic": topic,
             "rate_hz": round(rate, 3),
             "usual_hz": usual,
             "age_s": round(age_s, 3),
-            "assessment": assessment(rate, usual, age_s) if is_live else None,
+            "assessment": assessment(rate, usual, age_s, window_s) if is_live else None,
         }
 
 
-def assessment(rate: float, usual: float | None, age_s: float) -> str:
+def assessment(rate: float, usual: float | None, age_s: float, window_s: float) -> str:
     """Compares a topic's rate with its usual one (Hz): `as usual`, `slow`, `fast` or `silent`.
 
-    `age_s` is how much older its newest message is than the newest of all topics. Without a usual
-    rate a topic is `as usual`.
+    `age_s` is how much older its newest message is than the newest of all topics, `window_s` the
+    length of the data that the rate is of. Without a usual rate a topic is `as usual`.
     """
-    window_s = unix_from_ns(WINDOW_NS)
     if usual is None:
         return AS_USUAL
-    if age_s > max(window_s, _SILENT_PERIODS / usual):
+    if age_s > max(unix_from_ns(WINDOW_NS), _SILENT_PERIODS / usual):
         return "silent"
     if usual * window_s >= _MIN_MESSAGES and rate < usual / 2:
         return "slow"

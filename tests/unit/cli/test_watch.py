@@ -41,7 +41,7 @@ def test_a_rate_is_assessed_by_what_is_usual() -> None:
         (0.1, 0.4, 5.0, AS_USUAL),
         (0.0, None, 1000.0, AS_USUAL),
     ):
-        assert assessment(rate, usual, age_s) == expected
+        assert assessment(rate, usual, age_s, 10.0) == expected
 
 
 def rows_of(output: str) -> dict[str, str]:
@@ -57,6 +57,19 @@ def test_each_look_says_of_every_topic_whether_its_rate_is_as_usual(exits: Progr
     assert rows["/odom"].endswith(AS_USUAL)
     assert rows["/chatter"].endswith("silent")
     assert rows["/bumper"].endswith("slow")
+
+
+@pytest.mark.parametrize("has_earlier", [False, True])
+def test_a_recording_that_has_just_begun_has_its_usual_rates(
+    tmp_path: Path, exits: Program, has_earlier: bool
+) -> None:
+    now, folder = time.time_ns(), tmp_path / "new"
+    spans = {"a": (-300, -200), "b": (-4, 0)} if has_earlier else {"b": (-4, 0)}
+    for name, (start, stop) in spans.items():
+        times = range(now + start * NS_PER_S, now + stop * NS_PER_S + 1, NS_PER_S // 10)
+        write_mcap(folder / name / f"{name}_0.mcap", [odom(at, 0.0, 0.0) for at in times])
+    [row] = exits(0, f"watch --count 1 --json --bag-dir {folder}").json["topics"]
+    assert (row["rate_hz"], row["assessment"]) == (10, AS_USUAL)
 
 
 def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
