@@ -142,6 +142,7 @@ class LossCounter:
         """Forgets what is known of topics, all if None: a split does not show their messages."""
         for topic in [*self._series] if topics is None else topics:
             self._series.pop(topic, None)
+            self._counted.discard(topic)
 
     def add_split(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
         """Adds the next split of a recording; returns the losses that are certain by now."""

@@ -243,6 +243,21 @@ def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
     assert silent == {"/odom"}
 
 
+def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = reception(tmp_path)
+    made.overrides("a")
+    made.learn("a", split(tmp_path / "a_0.mcap", 20, 10))
+    made.note_lost("a", "/odom", 3)  # which the stamps of that split would show
+    assert read_losses(tmp_path, MIN_NS, MAX_NS) == []
+    monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
+    made.learn("a", split(tmp_path / "a_1.mcap", 20, 20))
+    made.note_lost("a", "/odom", 7)
+    [loss] = read_losses(tmp_path, MIN_NS, MAX_NS)
+    assert (loss.topic, loss.lost, loss.by) == ("/odom", 7, "rosbag2")
+
+
 def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
     assert newest_splits(tmp_path) == []
     assert newest_splits(tmp_path / "none") == []
