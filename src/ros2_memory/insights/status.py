@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
+from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.errors import BagError, RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
@@ -338,7 +339,7 @@ def _growth_per_day(snapshot: Snapshot, foreign: Collection[str]) -> int | None:
     """
     latest = snapshot.dating.latest or 0
     recent = takewhile(lambda bag: bag.end >= latest - _GROWTH_NS, reversed(snapshot.bags))
-    own = [bag for bag in recent if bag.file not in foreign]
+    own = [bag for bag in recent if not (bag.file in foreign or is_thinned(bag.file))]
     span = latest - min((bag.start for bag in own), default=latest)
     if span < _LEAST_GROWTH_NS:
         return None

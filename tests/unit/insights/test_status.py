@@ -190,6 +190,21 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
         assert (budget["used_gb"], budget["state_gb"]) == (counted / 1e9, derived / 1e9)
 
 
+def test_what_stays_of_deleted_bags_does_not_slow_the_growth_of_the_others(tmp_path: Path) -> None:
+    write_splits(tmp_path, [odom(BEGIN + t * S) for t in range(60)])
+    beat(tmp_path, BEGIN + 60 * S)
+    limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
+
+    def growth() -> float:
+        memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S), limits=limits)
+        return float(shown(memory)["budget"]["growth_gb_per_day"])
+
+    without_memory = growth()
+    day = [odom(BEGIN - hour * 3600 * S) for hour in range(26, 2, -1)]
+    write_mcap(tmp_path / "memory" / "20260713.thinned.mcap", day)
+    assert growth() == without_memory
+
+
 @each_way
 def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     tmp_path: Path, recalls: bool
