@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final, NamedTuple, TypeVar
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import ERASING_FILE, MOMENTS_FOLDER, is_carried
+from ros2_memory.bag_dir.layout import ERASING_FILE, MOMENTS_FOLDER, is_derived
 from ros2_memory.bag_dir.state_files import describe_leaving, is_shipped, read_receipts
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
@@ -439,7 +439,7 @@ def check_shipping(robot: Examined) -> Iterator[Finding]:
     for bag in robot.snapshot.bags:
         name = relative(bag.file, str(bag_dir))
         is_moment = name.startswith(f"{MOMENTS_FOLDER}/")
-        if bag.state is not BagState.CLOSED or is_carried(bag.path) or is_moment:
+        if bag.state is not BagState.CLOSED or is_derived(bag.path) or is_moment:
             continue
         closed.append(bag)
         if not is_shipped(receipts, name, bag.size):

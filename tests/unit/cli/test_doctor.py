@@ -320,7 +320,8 @@ def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_n
     seen = examined(1, required)["shipping"][0]["seen"]
     assert seen == f"2 of 2 closed bags not shipped; the newest receipt is from {iso_local(old)}"
     append_receipts(robot, [replace(other, bag="old/old_0.mcap", size=path.stat().st_size)])
-    # The other one has just been closed.
+    # The other one has just been closed, and no thinned day is ever shipped.
+    write_mcap(robot / "memory" / "20261120.thinned.mcap", [odom(old, 0.0, 0.0)])
     assert examined(0, required) == {}
 
 
