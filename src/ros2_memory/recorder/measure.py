@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.index.segment import Pace, TopicTotals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -536,10 +537,14 @@ def largest_burst(published: Sequence[Ns]) -> int:
 
 @dataclass(slots=True)
 class _Topic:
-    """A topic since its last silence, which ended at the log time `resumed`."""
+    """A topic since its last silence, which ended at the log time `resumed`.
+
+    `latched`: whether all of its publishers are transient local.
+    """
 
     arrival: Arrival
     resumed: Ns | None = None
+    latched: bool = False
 
     @property
     def patience(self) -> Ns:
@@ -549,6 +554,9 @@ class _Topic:
         arrival = self.arrival
         if arrival.messages < _REGULAR or arrival.last - arrival.first < MEASURED_NS:
             return False
+        totals = TopicTotals(arrival.first, arrival.last, arrival.messages)
+        if self.latched and Pace(totals, arrival.first, arrival.last).is_rare:
+            return False  # its publisher is silent until something changes
         return self.resumed is None or now - self.resumed > IRREGULAR_NS
 
 
@@ -584,6 +592,8 @@ class Arrivals:
                 self._silent.discard(name)
             if max(arrival.pause, arrival.first - last) > patience:
                 topic.arrival, topic.resumed = arrival, arrival.first
+        for name, flow in split.flows.items():
+            self._topics[name].latched = flow.offered.latched
 
     def silent_topics(self, idle: Ns) -> frozenset[str]:
         """Returns the regular topics that have not come for ten periods, and for 10 s at least.

@@ -243,6 +243,21 @@ def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
     assert silent == {"/odom"}
 
 
+@pytest.mark.parametrize(("period_s", "falls_silent"), [(6, False), (2, True)])
+def test_a_latched_topic_is_silent_until_something_changes(
+    tmp_path: Path, period_s: int, falls_silent: bool
+) -> None:
+    made = reception(tmp_path)
+    made.overrides("a")
+    for number in range(10):
+        begin = T0 + number * 30 * NS
+        states = [text(begin + s * NS, "here", "/mode") for s in range(0, 30, period_s)]
+        layout = McapLayout(latched=frozenset({"/mode"}))
+        made.learn("a", write_mcap(tmp_path / f"a_{number}.mcap", states, layout))
+    silent, _ = made.arrivals(200 * NS)
+    assert silent == ({"/mode"} if falls_silent else set())
+
+
 def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
