@@ -208,6 +208,7 @@ class RecordingSession:
 
     Attributes:
         is_listed: whether the list of own recordings has its directory.
+        is_beside: whether it has not taken over: another session has all of its messages, too.
         has_recorded: whether the child has ever reported that it records.
         grew_at: when the splits last grew (wall time).
         subscribed: topics that the child has subscribed to, whether it receives them or not.
@@ -222,6 +223,7 @@ class RecordingSession:
     def __post_init__(self) -> None:
         self.state = SessionState.STARTING
         self.is_listed = False
+        self.is_beside = False
         self.has_recorded = False
         self.grew_at = self.began.wall
         self.subscribed: set[str] = set()
@@ -351,8 +353,8 @@ class RecordingSessions:
 
     Args:
         announce: is called with the name of a recording before anything of it exists.
-        interrupted: is called when a recording ended unexpectedly, with the wall time at which it
-            last grew, and with how it ended.
+        interrupted: is called when a recording ended unexpectedly, unless it had not taken over,
+            with the wall time at which it last grew, and with how it ended.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -419,6 +421,7 @@ class RecordingSessions:
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
+        new.is_beside = True
         self.handover = HandoverTransfer(old, new, now, self.orders)
         self.events.info("rotation_begun", recording=old.name, next=name)
 
@@ -503,7 +506,8 @@ class RecordingSessions:
 
     def _note_interruption(self, session: RecordingSession, how: Interruption) -> None:
         self.restarts += 1
-        self.interrupted(session.grew_at, how)
+        if not session.is_beside:
+            self.interrupted(session.grew_at, how)
 
     def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
@@ -623,8 +627,12 @@ class RecordingSessions:
         self._completed[handover.old.name] = handover
         self._unsettled.append(handover.directories)
         handover.old.end()
-        self.current, self.handover = handover.new, None
+        self._make_current(handover.new)
         self.events.info("rotated", recording=handover.old.name, next=handover.new.name)
+
+    def _make_current(self, session: RecordingSession) -> None:
+        session.is_beside = False
+        self.current, self.handover = session, None
 
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session of a handover; the old one continues."""
@@ -641,9 +649,9 @@ class RecordingSessions:
             self._abandon(handover)
         elif session is self.current:
             session.end()
-            self.current, self.handover = None, None
+            self.current = None
             if handover is not None:
-                self.current = handover.new
+                self._make_current(handover.new)
                 self._unsettled.append(handover.directories)
                 self.settle_handovers()
 

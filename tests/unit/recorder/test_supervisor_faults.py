@@ -329,6 +329,23 @@ def test_nothing_is_recorded_onto_another_disk_and_it_goes_on_when_the_disk_is_b
         assert list(world.bag_dir.iterdir()) == []
 
 
+@pytest.mark.parametrize("how", ["died", "hung"])
+def test_nothing_is_lost_with_a_recorder_that_has_not_taken_over_yet(
+    tmp_path: Path, how: str
+) -> None:
+    world = rotating(tmp_path, 22, housekeeper=keeper_of(tmp_path))
+    old, new = world.recorders
+    if how == "died":
+        new.die()
+    else:
+        new.ends_with = -9
+        world.set_clock(-3600)
+    world.run(3)
+    assert (old.status, new.status) == (None, -9)
+    assert world.heartbeat()["restarts"] == 1
+    assert lost_in(tmp_path) == []
+
+
 def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     world = World(bag_dir, housekeeper=keeper_of(bag_dir)).started(3)
