@@ -235,10 +235,8 @@ def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
         path = tmp_path / f"a_{number}.mcap"
         made.learn("a", write_mcap(path, [*odometry[:20], seldom, *odometry[20:]]))
     silent, rates_hz = made.arrivals(0)
-    assert (silent, rates_hz) == (
-        set(),
-        {"/odom": pytest.approx(20, rel=0.01), "/chatter": pytest.approx(1 / seconds, rel=0.01)},
-    )
+    assert silent == frozenset()
+    assert rates_hz == pytest.approx({"/odom": 20, "/chatter": 1 / seconds}, rel=0.01)
     silent, _ = made.arrivals(11 * NS)
     assert silent == {"/odom"}
 
