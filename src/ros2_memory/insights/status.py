@@ -93,7 +93,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
-        never_heard=() if heartbeat is None else heartbeat.silent,
+        never_heard=() if heartbeat is None else _never_heard(snapshot, heartbeat),
         lost={} if heartbeat is None or not live else heartbeat.lost,
         fell_silent=tuple(_fallen_silent(memory, snapshot)),
         silences=tuple(silences_of(memory, snapshot)),
@@ -157,6 +157,12 @@ def state_of(heartbeat: Heartbeat, *, live: bool) -> str:
     if live or heartbeat.state is RecorderState.STOPPED:
         return str(heartbeat.state)
     return DIED
+
+
+def _never_heard(snapshot: Snapshot, heartbeat: Heartbeat) -> tuple[str, ...]:
+    """Returns the topics that a recorder hears nothing of, and that no bag has, either."""
+    recorded = {*snapshot.timeline.topics()}
+    return tuple(topic for topic in heartbeat.silent if topic not in recorded)
 
 
 def _last_heard(snapshot: Snapshot) -> Ns | None:

@@ -317,7 +317,7 @@ class Status(AnswerWithNotes):
         live: whether the recorder is running.
         restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
         missing: topics that it should record by name, and that no publisher offers.
-        never_heard: topics that it subscribed to and that sent no message.
+        never_heard: topics that it subscribed to, and of which no message is recorded.
         fell_silent: topics that had messages, but not lately.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.

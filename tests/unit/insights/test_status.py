@@ -190,6 +190,15 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
         assert (budget["used_gb"], budget["state_gb"]) == (counted / 1e9, derived / 1e9)
 
 
+def test_a_topic_that_is_recorded_was_heard_though_its_recorder_hears_it_no_more(
+    tmp_path: Path,
+) -> None:
+    """Each rotation begins a recording, and an event may come once a day."""
+    memory = remembering(tmp_path)
+    beat(tmp_path, BEGIN + 59 * S, subscribed=("/odom", "/scan"), silent=("/odom", "/scan"))
+    assert shown(memory)["never_heard"] == ["/scan"]
+
+
 def test_what_stays_of_deleted_bags_does_not_slow_the_growth_of_the_others(tmp_path: Path) -> None:
     write_splits(tmp_path, [odom(BEGIN + t * S) for t in range(60)])
     beat(tmp_path, BEGIN + 60 * S)
