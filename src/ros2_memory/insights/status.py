@@ -418,14 +418,14 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
 
     None for latched topics, and for logs, whose lines come when something happens. None as well if
-    no bag has two messages, or all came at once.
+    no bag has two messages, or all came at once. Thinned days show no rate.
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
     last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
     window = TimeWindow.before(last, _RATE_WINDOW_NS)
     bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
-    parts = [part for bag in bags for part in bag.summary.of(topic)]
+    parts = [part for bag in bags if not is_thinned(bag.file) for part in bag.summary.of(topic)]
     intervals = sum(part.count - 1 for part in parts)
     duration = sum(part.last - part.first for part in parts)
     if not intervals or duration < _SHORTEST_RATED_NS:

@@ -16,7 +16,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Span
 from ros2_memory.history import coverage
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.insights.status import memory_status
+from ros2_memory.insights.status import memory_status, usual_rate
 from ros2_memory.retention.policy import RetentionLimits
 from tests.support.bags import (
     McapLayout,
@@ -197,6 +197,16 @@ def test_a_topic_that_is_recorded_was_heard_though_its_recorder_hears_it_no_more
     memory = remembering(tmp_path)
     beat(tmp_path, BEGIN + 59 * S, subscribed=("/odom", "/scan"), silent=("/odom", "/scan"))
     assert shown(memory)["never_heard"] == ["/scan"]
+
+
+def test_what_stays_of_deleted_bags_shows_no_rate(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(BEGIN + t * S, True) for t in range(60)])
+    path = [odom(BEGIN - (100 - t) * 2 * S) for t in range(50)]
+    write_mcap(tmp_path / "memory" / "20260713.thinned.mcap", path)
+    memory = memory_of(tmp_path)
+    snapshot, latching = memory.index.snapshot(), memory.limits.latching
+    rates = {topic: usual_rate(snapshot, topic, latching) for topic in ("/bumper", "/odom")}
+    assert rates == {"/bumper": 1.0, "/odom": None}
 
 
 def test_what_stays_of_deleted_bags_does_not_slow_the_growth_of_the_others(tmp_path: Path) -> None:
