@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.index.segment import Pace, TopicTotals
 
 if TYPE_CHECKING:
@@ -506,8 +506,11 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
     for record in reader.records(path, [*topics], window):
         topics[record.channel.topic].add(record)
     split = SplitMeasure({}, {}, {})
+    # Latched messages may be written again with the times that they had.
+    begun = min((total.first for total in summary.topics if not total.latched), default=MIN_NS)
     for total in summary.topics:
-        arrival = Arrival(total.first, total.last, total.count, topics[total.topic].pause)
+        first, last = max(total.first, begun), max(total.last, begun)
+        arrival = Arrival(first, last, total.count, topics[total.topic].pause)
         known = split.arrivals.get(total.topic)  # of another type
         split.arrivals[total.topic] = arrival if known is None else known.joined(arrival)
     for topic, messages in topics.items():

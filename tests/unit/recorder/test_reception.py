@@ -241,6 +241,24 @@ def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
     assert silent == {"/odom"}
 
 
+def test_a_latched_message_that_begins_each_split_again_changes_no_rate(tmp_path: Path) -> None:
+    """Its log time is that of long before: see `recorder.repeat_latched`."""
+    made = reception(tmp_path)
+    made.overrides("a")
+    layout = McapLayout(latched=frozenset({"/map_name"}))
+    for number in range(4):
+        begin = T0 + number * 10 * NS
+        odometry = [odom(begin + tick * NS // 20, 1.0, 2.0) for tick in range(200)]
+        repeated = text(T0 - 3600 * NS, "ground floor", "/map_name")
+        made.learn("a", write_mcap(tmp_path / f"a_{number}.mcap", [repeated, *odometry], layout))
+    _, rates_hz = made.arrivals(0)
+    assert rates_hz["/odom"] == pytest.approx(20, rel=0.01)
+    made.note_refused("a", "/scan")
+    made.learn("a", write_mcap(tmp_path / "a_4.mcap", [repeated, *odometry], layout))
+    [loss] = read_losses(tmp_path, MIN_NS, MAX_NS)
+    assert (loss.topic, loss.start >= T0) == ("/scan", True)
+
+
 @pytest.mark.parametrize(("period_s", "falls_silent"), [(6, False), (2, True)])
 def test_a_latched_topic_is_silent_until_something_changes(
     tmp_path: Path, period_s: int, falls_silent: bool
