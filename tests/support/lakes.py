@@ -10,7 +10,7 @@ import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.expressions import AlwaysTrue
 
-from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
@@ -29,7 +29,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, START_S
-from tests.support.memories import extractor, memory_of, with_store
+from tests.support.memories import extractor, memory_of
 
 LATER = (START_S + 86_400) * NS_PER_S
 
@@ -54,15 +54,12 @@ def robot_bags(
     cache: Sequence[Path] | None = None,
     limits: StoreLimits | None = None,
 ) -> RobotBags:
-    """A robot whose bags are shipped; its store is full, or an empty one at a path of `cache`."""
+    """A robot whose bags are shipped, with a store: its own, or at a path of `cache`."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = memory_of(bag_dir, clock=clock)
-    if cache is None:
-        memory = with_store(memory, bag_dir)
-    else:
-        memory = replace(
-            memory, scanner=Scanner(ColumnStore(cache, memory.reader.definition), bag_dir)
-        )
+    paths = [bag_dir / OWN_FOLDER / FILE] if cache is None else cache
+    store = ColumnStore(paths, memory.reader.definition)
+    memory = replace(memory, scanner=Scanner(store, bag_dir))
     limits = limits or StoreLimits()
     filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits)
     return RobotBags(name, memory, McapReader(), "test", messages, filling)
