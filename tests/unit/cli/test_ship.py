@@ -20,8 +20,10 @@ from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.upkeep import TOMBSTONES_FILE
 from ros2_memory.lake.warehouse import LakeLocation, writing_alone
 from tests.support.fleets import START_S, seeded, write_robot
-from tests.support.lakes import lake_column, write_bag
+from tests.support.lakes import lake_column, selecting_here, write_bag
 from tests.support.program import Printed, Program
+
+__all__ = ["selecting_here"]
 
 Ship = Callable[..., Printed]
 Capture = pytest.CaptureFixture[str]
@@ -186,6 +188,7 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
         assert "hunter2" not in refused
 
 
+@pytest.mark.usefixtures("selecting_here")
 def test_a_select_is_answered_over_the_tables_as_they_are_now(
     ship: Ship, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
