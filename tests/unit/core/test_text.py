@@ -48,6 +48,6 @@ def test_a_glob_of_many_stars_takes_no_long_search() -> None:
 
 
 def test_escapes_of_a_string_that_does_not_end_take_no_long_search() -> None:
-    hostile = '{"' + '\\"' * 500_000
+    hostile = '{"' + '\\"' * 200_000
     assert caseless(hostile) == hostile
     assert caseless(f'["\\u00c4", {hostile}') == f'["ä", {hostile}'
