@@ -65,7 +65,8 @@ def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> No
 
 
 def test_a_page_that_is_not_served_is_not_announced(bag_dir: Path, tmp_path: Path) -> None:
-    program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir), "server.page=false"]
+    write_command(tmp_path)
+    program = [str(tmp_path / "ros2-memory"), "serve", str(bag_dir), "server.page=false"]
     with serving(bag_dir, tmp_path / "log", program=program) as served:
         assert served.get("/")[0] == 404
         served.process.terminate()
@@ -237,7 +238,8 @@ def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> N
     with service_manager(tmp_path / "notify") as manager:
         address = str(tmp_path / "notify")
         env = environment(tmp_path, NOTIFY_SOCKET=address, MCP_TRANSPORT="sse", MCP_PORT="0")
-        argv = command("recorder=none")
+        write_command(tmp_path)
+        argv = [str(tmp_path / "ros2-memory-server"), "recorder=none"]
         with subprocess.Popen(argv, env=env, stderr=subprocess.DEVNULL) as server:
             assert manager.recv(100) == b"READY=1"
             server.send_signal(signal.SIGTERM)
