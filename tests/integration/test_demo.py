@@ -128,7 +128,7 @@ def test_its_server_ends_with_it_where_it_is_killed(scratch: Path) -> None:
 def test_a_port_in_use_is_named_and_nothing_stays(scratch: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        refused = ended(scratch, "--port", str(port))
+        refused = ended(scratch, "--port", str(port), "--duration", "95")
     assert refused.returncode == 2
     assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
     assert list(scratch.iterdir()) == []
