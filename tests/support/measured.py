@@ -1,7 +1,7 @@
 """In which tests coverage is measured, which takes up to five times as long as the test itself.
 
 Measured is the first example of each plain test; what the others run, tests of the same room or of
-the tools above it run as well: 89 % of all lines and branches together, the gate is 85 %.
+the tools above it run as well: 87 % of all lines and branches together, the gate is 85 %.
 """
 
 import sys
@@ -20,57 +20,78 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 UNMEASURED = (
+    "cli/test_export.py::test_other_programs",
     "cli/test_forget.py",
     "cli/test_plot.py",
     "columns/test_fill.py",
     "columns/test_fragments.py",
     "columns/test_scan.py",
-    "columns/test_store.py::test_no_byte",
+    "columns/test_store.py",
+    "counts/test_column_numbers.py",
     "episodes/*.py",
     "faults/*.py",
+    "fleet/test_tools.py",
+    "fleet/test_who_may_ask.py",
     "fuzz/*.py",
+    "history/test_frames.py",
+    "history/test_latching.py",
     "home/*.py",
     "integration/*.py",
     "lake/test_forgetting.py",
     "lake/test_index.py",
+    "lake/test_lake_fleet.py::test_a_bag_",
+    "lake/test_lake_fleet.py::test_a_lake_that",
+    "lake/test_lake_fleet.py::test_a_server_starts",
+    "lake/test_lake_fleet.py::test_robots_",
+    "lake/test_lake_fleet.py::test_what_retention_deleted",
     "lake/test_reader.py",
+    "lake/test_select.py::test_rows_",
     "lake/test_shipper.py",
     "lake/test_tables.py",
+    "mcap/test_writer.py",
     "oracle/*.py",
     "recorder/test_days.py",
-    "recorder/test_screened_recordings.py",
     "recorder/test_supervisor*.py",
+    "retention/test_deleted_bags.py",
+    "serving/test_backfill.py::test_what_followed",
     "soak/*.py",
     "test_any_cut.py",
     "test_cancelled.py",
     "test_clock_steps.py",
+    "test_config.py",
     "test_confinement.py::test_no_text_of_a_caller",
     "test_confinement.py::test_no_tool_reads",
     "test_deep_directories.py",
     "test_documents.py",
-    "test_driven_inside.py",
     "test_forget_messages.py::test_whatever_was_done",
-    "test_gaps_within.py",
+    "test_honesty.py::test_no_reply_about_a_memory_from_time_zero",
     "test_hostile_*.py",
     "test_latched_carry.py",
     "test_mcap_reader.py::test_of_uncompressed_files",
-    "test_no_data.py::test_no_reply_about_a_memory_from_time_zero",
     "test_path_length.py",
+    "test_quoted.py",
     "test_real_bags.py",
-    "test_region_visits.py",
     "test_reply_size.py",
     "test_repository.py",
+    "test_search_replies.py",
     "test_standstills.py",
     "test_storage_limits.py",
-    "test_thinned_moments.py",
+    "test_times.py",
     "test_unlike_robots.py",
     "test_visits.py",
     "things/test_compare.py",
+    "things/test_find.py::test_a_detector_that_repeats",
+    "things/test_find.py::test_a_thing_with_a_routine",
+    "things/test_find.py::test_find_things_answers",
+    "things/test_find.py::test_of_a_window_before",
+    "things/test_find.py::test_things_of_a_robot_that",
+    "things/test_find.py::test_what_is_said_of_a_past",
+    "things/test_find.py::test_where_a_machine_was_slow",
 )
 """Files, or tests of a file by how their names begin, that are not measured.
 
 They ask much of everything at once, of hours of poses, or of programs over and over, and what they
-run others run too: the lines and branches that they alone reach are 4 % of all.
+run others run too: the lines and branches that they alone reach are 6 % of all.
 """
 FOREIGN = (
     "omegaconf:OmegaConf.load",
