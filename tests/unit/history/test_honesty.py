@@ -389,24 +389,7 @@ def test_what_is_reported_stays_short_however_much_was_lost(
     assert sum(map(len, told)) < 2000
 
 
-@pytest.mark.parametrize(
-    ("tool", "given"),
-    [
-        ("visits", {"x": 0.0, "y": 0.0, "radius_m": 9.0}),
-        ("find_things", {}),
-        ("recap", {}),
-        ("compare", {"with_start": T0_S + 28, "with_end": T0_S + 40}),
-        ("trajectory_summary", {"frame_id": "map"}),
-        (
-            "find_matches",
-            {"topic": "/odom", "field": "position.x", "condition_type": "above", "value": 1.7},
-        ),
-        ("get_topic_in_range", {"topic": "/odom"}),
-    ],
-)
-def test_a_reply_names_the_damage_of_its_window_alone(
-    tmp_path: Path, tool: str, given: dict[str, object]
-) -> None:
+def test_a_reply_names_the_damage_of_its_window_alone(tmp_path: Path) -> None:
     """A file with damage on both sides of a window is whole there."""
     made: list[Msg] = []
     for at in range(T0, T0 + 60 * S, S // 5):
@@ -416,24 +399,27 @@ def test_a_reply_names_the_damage_of_its_window_alone(
     for at in (T0 + 10 * S, T0 + 50 * S):
         chunks = enumerate(chunks_of(path))
         spoil_chunk(path, next(nth for nth, chunk in chunks if chunk.message_end_time >= at))
-    memory = memory_of(tmp_path, recalls=tool not in {"visits", "recap", "get_topic_in_range"})
-    for start, is_named in ((0, True), (28, False), (45, True)):
-        window = {"start": T0_S + start, "end": T0_S + start + 12}
-        reply = asked(memory, tool, **given, **window)
-        assert "error" not in reply
-        assert ("could not be read whole" in str(reply)) == is_named
+    above = {"topic": "/odom", "field": "position.x", "condition_type": "above", "value": 1.7}
+    plain = memory_of(tmp_path)
+    stored = with_store(plain, tmp_path)
+    for memory, tool, asks in (
+        (plain, "visits", {"x": 0.0, "y": 0.0, "radius_m": 9.0}),
+        (stored, "find_things", {}),
+        (plain, "recap", {}),
+        (stored, "compare", {"with_start": T0_S + 28, "with_end": T0_S + 40}),
+        (stored, "trajectory_summary", {"frame_id": "map"}),
+        (stored, "find_matches", above),
+        (plain, "get_topic_in_range", {"topic": "/odom"}),
+    ):
+        for start, is_named in ((0, True), (28, False), (45, True)):
+            window = {"start": T0_S + start, "end": T0_S + start + 12}
+            reply = asked(memory, tool, **asks, **window)
+            assert "error" not in reply, tool
+            assert ("could not be read whole" in str(reply)) == is_named, tool
 
 
-@pytest.mark.parametrize(
-    ("parent", "child", "later", "reason"),
-    [
-        ("map", "nobody", 50, NoDataReason.FRAME_UNKNOWN),
-        ("/map", "base_link", 50, NoDataReason.GAP),
-        ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
-    ],
-)
 def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
-    tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
+    tmp_path: Path,
 ) -> None:
     """`map` is known for ten seconds, `odom` for a minute, and again three hours later."""
     for name, start, stop, pair in (
@@ -445,9 +431,14 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
         moved = [tf(at, transform(at, *pair, (0.0, 0.0, 0.0))) for at in ticks]
         write_mcap(tmp_path / f"{name}.mcap", moved)
     plain = memory_of(tmp_path)
-    asks = {"parent": parent, "child": child, "timestamp": T0_S + later}
     for memory in (plain, with_store(plain, tmp_path)):
-        assert asked(memory, "get_transform_at", **asks)["reason"] == reason
+        for parent, child, later, reason in (
+            ("map", "nobody", 50, NoDataReason.FRAME_UNKNOWN),
+            ("/map", "base_link", 50, NoDataReason.GAP),
+            ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
+        ):
+            asks = {"parent": parent, "child": child, "timestamp": T0_S + later}
+            assert asked(memory, "get_transform_at", **asks)["reason"] == reason, asks
 
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])
