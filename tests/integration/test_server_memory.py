@@ -22,9 +22,9 @@ CACHED_MB = 160
 """What may stay: chunks (32 MB), columns (48 MB), and what the C library keeps of each arena."""
 AT_ONCE = 8
 SHAPES = {
-    "few": (24 if LONG else 3, 40 * MB, MB),
+    "few": (24 if LONG else 2, 40 * MB, MB),
     "many": (3000 if LONG else 300, 400_000, MB),
-    "together": (3000 if LONG else 200, 400_000, 60 * MB),
+    "together": (3000 if LONG else 160, 400_000, 60 * MB),
 }
 """How many messages of how many bytes, and the size of a chunk."""
 _BOTH = (CompressionType.ZSTD, CompressionType.LZ4)
