@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import zstandard
 
 from ros2_memory.columns.fill import RETRY_NS, Progress
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
@@ -26,18 +25,13 @@ from ros2_memory.storage.errors import reading
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.faults.failing_disk import LOOK, OPEN, PASSING, failing
-from tests.faults.world import NOW, T0, fill_up, served, told, write_bag, write_bags
+from tests.faults.world import NOW, T0, compress, fill_up, served, told, write_bag, write_bags
 from tests.support.bags import odom, write_db3
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 
 READS = int(os.environ.get("FAULTS_READS", "4"))
 COUNT = 3
-
-
-def compressed(path: Path) -> None:
-    path.with_name(f"{path.name}.zstd").write_bytes(zstandard.compress(path.read_bytes()))
-    path.unlink()
 
 
 def memory_at(bag_dir: Path, reader: BagReader | None = None) -> tuple[Memory, SettableClock]:
@@ -82,7 +76,7 @@ def test_a_call_that_fails_hides_nothing_for_good(
 ) -> None:
     for path in write_bags(tmp_path, COUNT):
         if packed:
-            compressed(path)
+            compress(path)
     right = told(memory_at(tmp_path)[0], count=COUNT)
     with failing(monkeypatch, functions) as disk:
         assert told(memory_at(tmp_path)[0], count=COUNT) == right
@@ -164,7 +158,7 @@ def test_too_many_open_files_are_a_fault_that_passes(tmp_path: Path, kind: str, 
     for number in range(COUNT):
         path = write_bag(tmp_path, number)
         if kind == "mcap.zstd":
-            compressed(path)
+            compress(path)
         if kind == "db3":
             path.unlink()
             write_db3(path.with_suffix(".db3"), [odom(T0 + number, 0.0, 0.0)])

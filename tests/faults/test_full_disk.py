@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import zstandard
 
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.index.file_state import RETRY_SOON_NS
@@ -14,16 +13,11 @@ from ros2_memory.storage.errors import UnreachableError
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.scratch import Scratch
 from tests.faults.small_disk import filled, needs_mounts, small_disk
-from tests.faults.world import NOW, told, write_bags
+from tests.faults.world import NOW, compress, told, write_bags
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 
 COUNT = 3
-
-
-def compressed(path: Path) -> None:
-    path.with_name(f"{path.name}.zstd").write_bytes(zstandard.compress(path.read_bytes()))
-    path.unlink()
 
 
 @needs_mounts
@@ -32,7 +26,7 @@ def test_bags_that_cannot_be_unpacked_say_why_and_are_read_when_there_is_room(
 ) -> None:
     bag_dir = tmp_path / "bags"
     for path in write_bags(bag_dir, COUNT):
-        compressed(path)
+        compress(path)
     right = told(memory_of(bag_dir, clock=NOW, storage="rosbag2"), count=COUNT)
     with small_disk(tmp_path / "temporary", "1m") as disk:
         monkeypatch.setattr(tempfile, "tempdir", str(disk))
@@ -55,7 +49,7 @@ def test_without_a_folder_for_temporary_files_no_bag_counts_as_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     [path] = write_bags(tmp_path, 1)
-    compressed(path)
+    compress(path)
 
     def none(**_: object) -> str:
         raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")

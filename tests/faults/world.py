@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import zstandard
+
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.maintenance.index import fill_store
@@ -46,6 +48,12 @@ def write_bag(bag_dir: Path, number: int) -> Path:
     path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages, layout)
     os.utime(path, ns=(start, start))
     return path
+
+
+def compress(path: Path) -> None:
+    """Leaves a bag compressed alone."""
+    path.with_name(f"{path.name}.zstd").write_bytes(zstandard.compress(path.read_bytes()))
+    path.unlink()
 
 
 def told(
