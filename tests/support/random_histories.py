@@ -134,7 +134,7 @@ def write_history(bag_dir: Path, draw: Random, tick: int = MS) -> Written:
         again = [_again(each, now) for each in robot.latched if each not in fresh]
         arrived = [*(again if draw.random() < 0.8 else ()), *fresh]
         if before is not None and draw.random() < 0.6:
-            arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in before[1][-6:]]
+            arrived += [shifted(each, draw.randint(10_000, 900_000)) for each in before[1][-6:]]
             if draw.random() < 0.4:
                 _hand_over(bag_dir, before[0], name, now)
                 # The recorder before stalled: it missed these.
@@ -143,7 +143,7 @@ def write_history(bag_dir: Path, draw: Random, tick: int = MS) -> Written:
                     for each in robot.between(min(before[1][0].log_time, now - S), now)
                     if each.topic not in LATCHED
                 ]
-                arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in missed]
+                arrived += [shifted(each, draw.randint(10_000, 900_000)) for each in missed]
         _write_recording(bag_dir / name, arrived, draw)
         if before is not None:
             settle_handover(bag_dir / before[0], bag_dir / name, McapReader())
@@ -175,10 +175,10 @@ def _spoil(bag_dir: Path, draw: Random) -> None:
 
 def _again(message: Msg, at: int) -> Msg:
     """A latched message as a later recording receives it."""
-    return _shifted(message, max(0, at - message.log_time))
+    return shifted(message, max(0, at - message.log_time))
 
 
-def _shifted(message: Msg, by: int) -> Msg:
+def shifted(message: Msg, by: int) -> Msg:
     """A message as a recording that overlaps logged it."""
     return replace(message, log_time=message.log_time + by, publish_time=message.published)
 

@@ -54,7 +54,7 @@ from tests.support.bags import (
 from tests.support.column_worlds import World, check_all, check_rows
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of
-from tests.support.random_histories import LATCHED, MS, WORDS, S, write_history
+from tests.support.random_histories import LATCHED, MS, WORDS, S, shifted, write_history
 from tests.support.tables import table
 
 T0: Final = 1_700_006_330 * S
@@ -453,13 +453,13 @@ def draw_recordings(draw: Random) -> Splits:
     whole = _published(draw, T0, seconds, quiet)
     if draw.random() < 0.1:
         set_at = T0 + draw.randrange(10, 50) * S
-        whole = [_later(message, 2500 * MS * (message.published >= set_at)) for message in whole]
+        whole = [shifted(message, 2500 * MS * (message.published >= set_at)) for message in whole]
     over = T0 + begin * S
     one = [message for message in whole if message.log_time < over + draw.randint(0, 9) * S]
     known = [message for message in one if message.topic in LATCHED and message.log_time < over]
     other = [
         *(replace(message, log_time=over) for message in known),
-        *(_later(m, draw.randrange(10_000, 900_000)) for m in whole if m.log_time >= over),
+        *(shifted(m, draw.randrange(10_000, 900_000)) for m in whole if m.log_time >= over),
     ]
     recordings = {"a": one, "b": other}
     third = draw.choice([None, T0 + (seconds + 90) * S, _UNSET])
@@ -503,10 +503,6 @@ def _published(draw: Random, start: int, seconds: int, quiet: range) -> list[Msg
             late = draw.choice([MS, MS, draw.randrange(4000) * MS]) + n
             found.append(replace(message, log_time=at + late, publish_time=at))
     return found
-
-
-def _later(message: Msg, by: int) -> Msg:
-    return replace(message, log_time=message.log_time + by, publish_time=message.published)
 
 
 def cut(recordings: Splits, cuts: Sequence[float]) -> Splits:
