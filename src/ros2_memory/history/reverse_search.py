@@ -162,7 +162,9 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     word = value.strip() if isinstance(value, str) else ""
     if not _CONSTANT_NAME.fullmatch(word):
         return value
-    _, _, name = field.rpartition(".")
+    shown, _, below = field.partition(".")
+    path = below or ".".join(view.extractor.fields_of(type_name).get(shown, (shown,)))
+    _, _, name = path.rpartition(".")
     number_field = re.compile(_NUMBER_FIELD.format(re.escape(name)), re.MULTILINE)
     for schema in _schemas_of(view, type_name):
         text = _text_of(schema)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 from mcap.writer import Writer
 
@@ -30,6 +31,7 @@ from tests.support.bags import (
     boolean,
     detections,
     goals,
+    header,
     make,
     odom,
     text,
@@ -71,6 +73,29 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
     assert at(newest("FULL", "/chatter", "value")) == 0  # a text stays one
     with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
         newest("EMPTY")
+
+
+@pytest.mark.parametrize("field", ["fix_status", "status.status"])
+def test_a_constant_names_the_number_of_a_field_that_replies_call_otherwise(
+    tmp_path: Path, field: str
+) -> None:
+    def fix(second: int, status: int) -> Msg:
+        body = make(
+            "sensor_msgs/msg/NavSatFix",
+            header=header(T0, "gps"),
+            status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
+            latitude=48.4,
+            longitude=11.7,
+            altitude=447.0,
+            position_covariance=np.zeros(9),
+            position_covariance_type=0,
+        )
+        return Msg("/fix", "sensor_msgs/msg/NavSatFix", T0 + second * NS_PER_S, body)
+
+    memory = remembered(tmp_path, [fix(0, 2), fix(1, -1), fix(2, 0)])
+
+    assert at(last(memory, "equals", "STATUS_NO_FIX", "/fix", field=field)) == 1
+    assert at(last(memory, "equals", "STATUS_GBAS_FIX", "/fix", field=field)) == 0
 
 
 def test_a_constant_that_is_no_whole_number_is_not_taken_for_one(tmp_path: Path) -> None:
