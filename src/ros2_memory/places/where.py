@@ -501,6 +501,8 @@ class _ConditionStates:
         if not messages or messages[0].time > start:
             before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
             messages = messages if before is None else [before, *messages]
+            # None lies between the two: earlier times need no further search.
+            start = MIN_NS if before is None else before.time + 1
         self._times, self._met = [], []
         for message in messages:
             met = self.search.matches(message)

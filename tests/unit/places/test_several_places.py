@@ -19,14 +19,16 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import boolean, octets, odom, text, tf, transform
+from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, remembered
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S
+from tests.support.noting_reader import NotingReader
 from tests.support.rooms import BEGIN, ROOMS, asked_of, bounds, draw, write
 from tests.support.tables import table
 
+T0 = 1_700_000_000 * S
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
 
 
@@ -147,6 +149,25 @@ def test_what_no_message_of_another_topic_can_meet_is_refused(
         for by in ({}, {"by": "hour"}):
             refused = asked(memory, "find_matches", **cup, **by, **{"while": during})
             assert said in refused["detail"]
+
+
+def test_what_a_rare_topic_said_last_is_looked_up_once_for_all_matches(tmp_path: Path) -> None:
+    """A search in a .db3 goes through all messages of other topics since then."""
+
+    def looks(matches: int) -> int:
+        bags = tmp_path / f"{matches}"
+        hellos = (text(T0 + nth * S, "hello" if nth % 2 else "bye") for nth in range(2 * matches))
+        state = text(T0, "SCOUTING", topic="/state")
+        write_mcap(bags / "rec" / "rec_0.mcap", [state, *hellos])
+        reader = NotingReader()
+        memory = memory_of(bags, reader=reader, recalls=True)
+        during = {"topic": "/state", "condition_type": "equals", "value": "SCOUTING"}
+        reader.asked.clear()
+        reply = asked(memory, "find_matches", limit=100, **HELLO, **{"while": during})
+        assert reply["total"] == matches
+        return sum("/state" in topics for _, topics in reader.asked)
+
+    assert looks(20) == looks(3)
 
 
 @each_way
