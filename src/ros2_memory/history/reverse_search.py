@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import heapq
 import re
+from bisect import bisect_left
 from contextlib import suppress
-from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
@@ -23,7 +23,7 @@ from ros2_memory.analysis.conditions import (
     NearPosition,
     parse_condition,
 )
-from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
+from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE, charge_of
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -131,27 +131,63 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     """Checks that a charge is not compared with percent if all messages state fractions.
 
     sensor_msgs/BatteryState asks for a fraction, but some drivers publish percent, or no charge.
-    Nothing is refused if there is no time to look at all messages.
+    A note says where a battery has stated both. Nothing is refused or noted if there is no time to
+    look at all messages.
 
     Raises:
         InvalidArgumentsError: the limit is in percent, and the charges are fractions.
     """
     test = condition.test
-    if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
+    if condition.field != "percentage" or not isinstance(test, Beyond):
         return
     brief = View(view.memory, view.call.within(READING_S), view.reach)
-    try:
-        charged, percent = (
-            ReverseSearch(brief, pattern, replace(condition, test=beyond)).newest(MAX_NS)
-            for beyond in (Beyond(0, above=True), Beyond(FULL_CHARGE, above=True))
-        )
-    except QueryTimeoutError:
-        return
-    if percent is None and charged is not None and charge_of(brief.value(charged)) is not None:
-        raise InvalidArgumentsError(
-            "value: percentage is a fraction here, from 0 to 1: "
-            f"{test.limit:g} % is {test.limit / 100:g}"
-        )
+    with suppress(QueryTimeoutError):
+        if newest_charge(brief, pattern, FULL_CHARGE) is not None:
+            for topic in matching_topics(brief, pattern):
+                if BATTERY in view.timeline.types_of(topic):
+                    view.notes.add(*_mixed_charges(brief, topic))
+            return
+        charged = newest_charge(brief, pattern, 0) if test.limit > FULL_CHARGE else None
+        if charged is not None and charge_of(brief.value(charged)) is not None:
+            raise InvalidArgumentsError(
+                "value: percentage is a fraction here, from 0 to 1: "
+                f"{test.limit:g} % is {test.limit / 100:g}"
+            )
+
+
+def newest_charge(
+    view: View, pattern: str, above: float, until: Ns = MAX_NS, since: Ns = MIN_NS
+) -> StoredMessage | None:
+    """Returns the newest message of batteries, before `until`, with a charge above a number.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    condition = Condition(Beyond(above, above=True), "percentage")
+    return ReverseSearch(view, pattern, condition).newest(until, since)
+
+
+def _mixed_charges(view: View, topic: str) -> tuple[str, ...]:
+    """Returns a note if a battery states fractions in its first recordings, then percent.
+
+    Or the reverse, as after an update of its driver.
+    """
+    spans = sorted(view.timeline.recordings(topic).values())
+
+    def is_percent(nth: int) -> bool:
+        first, last = spans[nth]
+        return newest_charge(view, topic, FULL_CHARGE, last + 1, first) is not None
+
+    was_percent = is_percent(0)
+    if was_percent == is_percent(-1):
+        return ()
+    nth = bisect_left(range(len(spans)), True, key=lambda nth: is_percent(nth) != was_percent)
+    (_, until), (since, _) = spans[nth - 1], spans[nth]
+    was, now = "a fraction, from 0 to 1,", "percent"
+    if was_percent:
+        was, now = "percent", "a fraction, from 0 to 1,"
+    switch = f"{was} until {unix_text(until)} and {now} from {unix_text(since)} on"
+    return (f"percentage of {topic} is {switch}: ask about each time with a limit of its own",)
 
 
 def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:

@@ -130,6 +130,28 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
     assert "BatteryState the values have no field 'percent'" in refused["detail"]
 
 
+@each_way
+def test_a_battery_that_stated_fractions_before_percent_is_noted(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    days = {"fri": [0.9, 0.7], "sat": [0.6, 0.1], "sun": [83.0, 0.8], "mon": [97.0, 90.0]}
+    for nth, (day, charges) in enumerate(days.items()):
+        times = (T0 + (1000 * nth + second) * NS_PER_S for second in range(2))
+        write_mcap(tmp_path / day / f"{day}_0.mcap", map(battery, times, charges))
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def notes(topic: str) -> list[str]:
+        given = {"topic": topic, "condition_type": "below", "field": "percentage", "value": 20}
+        reply = asked(memory, "find_matches", **given)
+        return [note for note in reply["notes"] if "fraction" in note]
+
+    said = (
+        "percentage of /battery_state is a fraction, from 0 to 1, until 1700001001.000000 and "
+        "percent from 1700002000.000000 on: ask about each time with a limit of its own"
+    )
+    assert notes("/battery_state") == notes("/battery*") == [said]
+
+
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
     question = (memory, Call(), "/battery_state")
