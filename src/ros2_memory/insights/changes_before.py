@@ -17,6 +17,7 @@ from ros2_memory.analysis.facts import (
     CHARGE,
     COMMAND,
     FLAG,
+    FULL_CHARGE,
     GOAL,
     GOALS,
     LOG,
@@ -28,13 +29,15 @@ from ros2_memory.analysis.facts import (
     has_events,
 )
 from ros2_memory.analysis.topic_events import Change, TopicEvents, joined_events
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import held_at, is_latched
+from ros2_memory.history.reverse_search import newest_charge
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     GOAL_WORDS,
@@ -431,5 +434,23 @@ def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
             continue
         message = view.stream.newest(topic, TimeWindow.before(at, _LEAD_NS))
         fraction = None if message is None else charge_of(view.value(message))
-        if fraction is not None:
-            yield topic, f"{fraction:.0%}"
+        if message is not None and fraction is not None:
+            is_of_percent = _is_nearly_empty(view, topic, message.time)
+            yield topic, f"{fraction / 100 if is_of_percent else fraction:.0%}"
+
+
+def _is_nearly_empty(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether the charge of a message is of the last percents of a battery.
+
+    0.9 % looks like a fraction, but percents that can be no fraction led to it in the hour before.
+    """
+    brief = View(view.memory, view.call.within(READING_S), view.reach)
+    since = max(at - _OLDEST_STATE_NS, MIN_NS)
+    try:
+        percent = newest_charge(brief, topic, FULL_CHARGE, at + 1, since)
+    except QueryTimeoutError:
+        return False
+    if percent is None or percent.time == at:
+        return False
+    charge = charge_of(brief.value(percent))
+    return charge is not None and charge < min(LOW_CHARGES)

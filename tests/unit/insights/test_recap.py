@@ -194,6 +194,22 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
     assert str(reply["before"]).count("/battery_state fell below 20%") == 1
 
 
+@each_way
+def test_the_last_percent_of_a_battery_is_no_full_one(tmp_path: Path, recalls: bool) -> None:
+    percents = [battery(at(t), max(6 - t * 0.1, 0.8)) for t in range(60)]
+    write_splits(tmp_path, [*percents, boolean(at(59), True)])
+    memory = memory_of(tmp_path, recalls=recalls)
+    states = [before(memory, float(t))["state"]["/battery_state"] for t in (20, 55)]
+    assert states == ["4%", "1%"]
+
+
+def test_a_fraction_after_an_update_is_no_percent(tmp_path: Path) -> None:
+    percents = [battery(at(t), 84.0) for t in range(30)]
+    fractions = [battery(at(t), 0.83) for t in range(30, 60)]
+    memory = remembered(tmp_path, [*percents, *fractions, boolean(at(59), True)])
+    assert before(memory, 55.0)["state"]["/battery_state"] == "83%"
+
+
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
     late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
     late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
