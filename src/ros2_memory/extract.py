@@ -45,6 +45,7 @@ from ros2_memory.messages.conversions import (
     names_of,
     nanoseconds,
     number,
+    own_path,
     parse_path,
     quadruple,
     rotation,
@@ -309,20 +310,8 @@ class SchemaExtractor:
         return None
 
     def own_path(self, path: str, type_name: str) -> str:
-        """Returns a full path in a message as a path in its extracted value.
-
-        For an odometry it returns `position.x` for `pose.pose.position.x`. A path that no mapped
-        field leads to is returned as it is, and so is one that begins with the name of another
-        field.
-        """
-        fields, segments = self.plan(type_name).fields, tuple(path.split("."))
-        longest, own_name = 0, ""
-        for name, mapped in fields.items():
-            is_other = segments[0] in fields and name != segments[0]
-            leads_there = segments[: len(mapped)] == mapped and not is_other
-            if leads_there and (len(mapped), name) > (longest, own_name):
-                longest, own_name = len(mapped), name
-        return ".".join((own_name, *segments[longest:])) if own_name else path
+        """Returns a full path in a message as a path in its extracted value; see `own_path`."""
+        return own_path(path, self.plan(type_name).fields)
 
     def fields_of(self, type_name: str) -> Mapping[str, Segments]:
         """Returns the fields that the schema map has for a type, with their paths."""
@@ -428,7 +417,9 @@ class SchemaExtractor:
             node = descend(message, segments, view)
         if node is ABSENT:
             node = _plain(self._at(message, segments))
-        return self._named_element(message, type_name, path) if node is ABSENT else node
+        if node is ABSENT:
+            return self._named_element(message, type_name, self.own_path(path, type_name))
+        return node
 
     def _named_element(self, message: object, type_name: str, path: str) -> object:
         """Returns the element of an array that has a name in the list beside it.

@@ -47,6 +47,7 @@ from ros2_memory.messages.conversions import (
     ValueKind,
     kind_of_type,
     names_beside,
+    own_path,
 )
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
@@ -180,7 +181,8 @@ class Shape:
             return node
         node = self.at(segments)
         if node is None:
-            return at_field(self.value, path) if names_beside(self.value, path) else None
+            own = own_path(path, self._fields)
+            return at_field(self.value, own) if names_beside(self.value, own) else None
         if any(leaf.conversion in _TURNS for leaf in leaves_of(node)):
             raise UnknownShapeError(f"{path} is a rotation, or has one")  # shown as x, y, z, w
         return node

@@ -155,6 +155,22 @@ def names_others(value: object, dot_path: str) -> bool:
     return bool(names) and name not in names
 
 
+def own_path(path: str, fields: Mapping[str, Sequence[str]]) -> str:
+    """Returns a full path in a message as a path in its extracted value.
+
+    For an odometry it returns `position.x` for `pose.pose.position.x`. A path that no mapped field
+    leads to is returned as it is, and so is one that begins with the name of another field.
+    """
+    segments = tuple(path.split("."))
+    longest, own_name = 0, ""
+    for name, mapped in fields.items():
+        is_other = segments[0] in fields and name != segments[0]
+        leads_there = segments[: len(mapped)] == tuple(mapped) and not is_other
+        if leads_there and (len(mapped), name) > (longest, own_name):
+            longest, own_name = len(mapped), name
+    return ".".join((own_name, *segments[longest:])) if own_name else path
+
+
 def _descend_each(
     nodes: Sequence[object] | Array,
     segments: Sequence[str],

@@ -157,3 +157,15 @@ def test_a_joint_holds_its_value_while_another_publisher_names_others(
     held = [(row["seconds"], row["value"]) for row in lift(changes=True)["changes"]]
     assert held == [(6.0, 0), (4.0, 0.5)]
     assert [row[:3] for row in lift(by="value")["rows"]] == [["0", 1, 6.0], ["0.5", 1, 4.0]]
+
+
+def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path) -> None:
+    messages = [joint_state(nth, ["elbow", "wrist"], [nth / 10, 9.0]) for nth in range(5)]
+    plain = remembered(tmp_path, messages)
+    given = {"topic": "/joints", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
+    for memory in (plain, with_store(plain, tmp_path)):
+        reply = asked(memory, "get_topic_in_range", fields=["position.elbow"], **given)
+        assert [angle for _, angle in reply["rows"]] == [0, 0.1, 0.2, 0.3, 0.4]
+        assert reply["extremes"]["position.elbow"]["max"] == 0.4
+        by_hour = asked(memory, "get_topic_in_range", fields=["position.elbow"], by="hour", **given)
+        assert by_hour["all"][by_hour["columns"].index("position.elbow.max") - 1] == 0.4
