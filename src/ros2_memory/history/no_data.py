@@ -32,6 +32,7 @@ from ros2_memory.history.coverage import (
     was_removed,
     why_nothing,
 )
+from ros2_memory.history.held_values import is_text
 from ros2_memory.index.file_state import HELD_BACK
 
 if TYPE_CHECKING:
@@ -354,10 +355,21 @@ def no_data_at(
         *_advice(view, reason, at),
     ]
     is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
-    if older and is_near and not _describe_future(view, at):
+    holds_on = older and tolerance is not None and _may_hold_on(view, older, at)
+    if older and (is_near or holds_on) and not _describe_future(view, at):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def _may_hold_on(view: View, older: StoredMessage, at: Ns) -> bool:
+    """Returns whether a message is a text that may hold until a later moment.
+
+    Such a topic says what a robot does when that changes, and nothing interrupted the recording.
+    """
+    pace = view.timeline.pace(older.topic, older.bag.recording)
+    is_of_same_run = at <= pace.end and not view.gaps(TimeWindow(older.time + 1, at))
+    return is_text(view, older.topic) and pace.is_rare and is_of_same_run
 
 
 def _distances(

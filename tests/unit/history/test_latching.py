@@ -230,3 +230,25 @@ def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
         [found] = answer["sightings"]
         assert (found["first_seen"] - T0_S, found["last_seen"] - T0_S) == (6, last)
     assert answer["unknown_s"] == 30
+
+
+@each_way
+def test_a_refusal_says_how_to_ask_what_a_rare_text_said_last(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A mission manager says what it does when that changes, minutes before."""
+    said = {0: "CHARGING", 400: "SCOUTING", 1000: "CHARGING"}
+    for begin in (0, 2000):
+        states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said.items()]
+        moving = [odom(T0 + (begin + at) * S, at) for at in range(1200)]
+        messages = sorted([*states, *moving], key=lambda message: message.log_time)
+        write_mcap(tmp_path / f"run{begin}" / "run_0.mcap", messages)
+    asking = memory_of(tmp_path, recalls=recalls)
+
+    refused = at(asking, "/mission", T0 + 900 * S)
+    advice = "to accept the older one, ask with tolerance_s of at least 500.000"
+    assert refused["detail"].endswith(advice)
+    given = {"topic": "/mission", "timestamp": T0 / S + 900, "tolerance_s": 500}
+    assert asked(asking, "get_topic_at_time", **given)["value"] == {"value": "SCOUTING"}
+    # Between two runs nobody knows.
+    assert "to accept" not in at(asking, "/mission", T0 + 1300 * S)["detail"]
