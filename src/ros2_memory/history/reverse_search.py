@@ -23,7 +23,7 @@ from ros2_memory.analysis.conditions import (
     NearPosition,
     parse_condition,
 )
-from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE, charge_of
+from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -69,6 +69,8 @@ MOST_UNSURE: Final = 32
 """Up to this many unsure rows of a part are left to their messages; for more, bags are decoded."""
 _MOST_LEFT: Final = 0.5
 """If the columns of a bag leave a larger share unsure, bags of that type are not decoded again."""
+_FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
+"""Fields that are fractions by the definitions of their messages."""
 _FIX_FIELDS: Final = frozenset({"latitude", "longitude", "altitude"})
 _MOST_TYPES: Final = 3
 """The constants of this many types are looked up: each reads the channels of a file."""
@@ -128,43 +130,45 @@ def condition_of(
 
 
 def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
-    """Checks that a charge is not compared with percent if all messages state fractions.
+    """Checks that fractions are not compared with percent: no message, or each, would match.
 
-    sensor_msgs/BatteryState asks for a fraction, but some drivers publish percent, or no charge.
-    A note says where a battery has stated both. Nothing is refused or noted if there is no time to
-    look at all messages.
+    sensor_msgs/BatteryState and RelativeHumidity ask for fractions, but some drivers publish
+    percent, or no charge. A note says where a battery has stated both. Nothing is refused or noted
+    if there is no time to look at all messages.
 
     Raises:
-        InvalidArgumentsError: the limit is in percent, and the charges are fractions.
+        InvalidArgumentsError: the limit is in percent, and all numbers are fractions.
     """
-    test = condition.test
-    if condition.field != "percentage" or not isinstance(test, Beyond):
+    test, field = condition.test, condition.field
+    if field not in _FRACTIONS or not isinstance(test, Beyond):
         return
     brief = View(view.memory, view.call.within(READING_S), view.reach)
     with suppress(QueryTimeoutError):
-        if newest_charge(brief, pattern, FULL_CHARGE) is not None:
+        if newest_above(brief, pattern, field, FULL_CHARGE) is not None:
             for topic in matching_topics(brief, pattern):
                 if BATTERY in view.timeline.types_of(topic):
                     view.notes.add(*_mixed_charges(brief, topic))
             return
-        charged = newest_charge(brief, pattern, 0) if test.limit > FULL_CHARGE else None
-        if charged is not None and charge_of(brief.value(charged)) is not None:
+        newest = newest_above(brief, pattern, field, 0) if test.limit > FULL_CHARGE else None
+        value = None if newest is None else brief.value(newest)
+        if isinstance(value, dict) and isinstance(value.get(field), float):
             raise InvalidArgumentsError(
-                "value: percentage is a fraction here, from 0 to 1: "
+                f"value: {field} is a fraction here, from 0 to 1: "
                 f"{test.limit:g} % is {test.limit / 100:g}"
             )
 
 
-def newest_charge(
-    view: View, pattern: str, above: float, until: Ns = MAX_NS, since: Ns = MIN_NS
+def newest_above(
+    view: View, pattern: str, field: str, limit: float, window: TimeWindow | None = None
 ) -> StoredMessage | None:
-    """Returns the newest message of batteries, before `until`, with a charge above a number.
+    """Returns the newest message (of a window) with a number above a limit in a field.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    condition = Condition(Beyond(above, above=True), "percentage")
-    return ReverseSearch(view, pattern, condition).newest(until, since)
+    search = ReverseSearch(view, pattern, Condition(Beyond(limit, above=True), field))
+    asked = window or TimeWindow.everything()
+    return search.newest(asked.stop, asked.start)
 
 
 def _mixed_charges(view: View, topic: str) -> tuple[str, ...]:
@@ -176,7 +180,8 @@ def _mixed_charges(view: View, topic: str) -> tuple[str, ...]:
 
     def is_percent(nth: int) -> bool:
         first, last = spans[nth]
-        return newest_charge(view, topic, FULL_CHARGE, last + 1, first) is not None
+        recorded = TimeWindow(first, last + 1)
+        return newest_above(view, topic, "percentage", FULL_CHARGE, recorded) is not None
 
     was_percent = is_percent(0)
     if was_percent == is_percent(-1):

@@ -37,7 +37,7 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import held_at, is_latched
-from ros2_memory.history.reverse_search import newest_charge
+from ros2_memory.history.reverse_search import newest_above
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     GOAL_WORDS,
@@ -445,9 +445,9 @@ def _is_nearly_empty(view: View, topic: str, at: Ns) -> bool:
     0.9 % looks like a fraction, but percents that can be no fraction led to it in the hour before.
     """
     brief = View(view.memory, view.call.within(READING_S), view.reach)
-    since = max(at - _OLDEST_STATE_NS, MIN_NS)
+    recent = TimeWindow.before(at, _OLDEST_STATE_NS)
     try:
-        percent = newest_charge(brief, topic, FULL_CHARGE, at + 1, since)
+        percent = newest_above(brief, topic, "percentage", FULL_CHARGE, recent)
     except QueryTimeoutError:
         return False
     if percent is None or percent.time == at:

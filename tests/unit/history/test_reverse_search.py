@@ -165,6 +165,21 @@ def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -
         assert queries.find_last_match(*question, "above", 20, field="percentage").found is None
 
 
+def test_percent_of_humidity_that_is_stated_as_a_fraction_is_refused(tmp_path: Path) -> None:
+    def humidity(second: int, fraction: float) -> Msg:
+        kind, ns = "sensor_msgs/msg/RelativeHumidity", T0 + second * NS_PER_S
+        stated = make(kind, header=header(ns, ""), relative_humidity=fraction, variance=0.0)
+        return Msg("/humidity", kind, ns, stated)
+
+    question = partial(asked, topic="/humidity", condition_type="above", field="relative_humidity")
+    memory = remembered(tmp_path / "fraction", [humidity(0, 0.91), humidity(1, 0.6)])
+    refused = question(memory, "find_matches", value=80)
+    assert refused["detail"].endswith("is a fraction here, from 0 to 1: 80 % is 0.8")
+    assert question(memory, "find_last_match", value=0.8)["timestamp"] == T0_S
+    memory = remembered(tmp_path / "percent", [humidity(0, 91.0), humidity(1, 60.0)])
+    assert question(memory, "find_last_match", value=80)["timestamp"] == T0_S
+
+
 @pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
 @pytest.mark.parametrize("word", ["STATE_HAULING", "hauling"])
 def test_never_of_a_word_names_the_constant_that_has_it(
