@@ -227,31 +227,40 @@ class MergedStream:
 
         A note reports what cannot be read, unless all of it lies before `since`.
         """
-        read = partial(
-            self.bags.read, topics=topics, window=window, newest_first=newest_first, since=since
-        )
+        read = partial(self.bags.read, topics=topics, newest_first=newest_first, since=since)
         if len(bags) == 1:
-            yield from read(bags[0].bag)
+            yield from read(bags[0].bag, window=_part_with_messages(bags[0], window))
             return
         sign = -1 if newest_first else 1
         # With the least sort key of each bag's messages: its first message, or its last one.
         waiting = deque(
             sorted(
-                (-extent.last if newest_first else extent.first, sign * rank, extent.bag)
+                (-extent.last if newest_first else extent.first, sign * rank, extent)
                 for rank, extent in enumerate(sorted(bags, key=_by_recording))
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
         while heap or waiting:
             if waiting and (not heap or waiting[0][0] <= heap[0][0]):
-                _, rank, bag = waiting.popleft()
-                source = read(bag)
+                _, rank, extent = waiting.popleft()
+                source = read(extent.bag, window=_part_with_messages(extent, window))
             else:
                 _, rank, stored, source = heapq.heappop(heap)
                 yield stored
             following = next(source, None)
             if following is not None:
                 heapq.heappush(heap, (sign * following.time, rank, following, source))
+
+
+def _part_with_messages(extent: TopicExtent, window: TimeWindow) -> TimeWindow:
+    """Returns the part of a window from the first to the last message of the topics in a bag.
+
+    A reader without an index by topic, as of a `.db3`, goes through all messages in the rest. What
+    is damaged there counts: a bag with remarks is read as it was asked for.
+    """
+    if extent.bag.state is not BagState.CLOSED or extent.bag.summary.remarks:
+        return window
+    return window.intersect(TimeWindow(extent.first, extent.last + 1))
 
 
 def _since_published(stored: StoredMessage) -> TimeWindow:

@@ -2,7 +2,7 @@
 
 import os
 import random
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +18,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
+from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -189,3 +190,33 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     for nth in range(0, 50, 6):
         found = asked(memory, "find_matches", **wanted, value=4_000 * nth + 700)
         assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]
+
+
+def test_the_newest_message_of_a_silent_topic_is_read_without_the_time_after_it(
+    tmp_path: Path,
+) -> None:
+    """A .db3 has no index by topic: its reader goes through all messages of a window."""
+    bumps = [boolean(T0, True), boolean(T0 + 1, False)]
+    write_mcap(
+        tmp_path / "rec" / "rec_0.mcap", [*bumps, *(odom(T0 + at * S, at) for at in range(100))]
+    )
+    write_mcap(tmp_path / "later" / "later_0.mcap", [odom(T0 + 200 * S, 200.0)])
+    windows: list[TimeWindow] = []
+
+    class Noting(McapReader):
+        def records(
+            self,
+            path: Path,
+            topics: Collection[str],
+            window: TimeWindow,
+            *,
+            newest_first: bool = False,
+        ) -> Iterator[Record]:
+            windows.append(window)
+            return super().records(path, topics, window, newest_first=newest_first)
+
+    view = View(memory_of(tmp_path, reader=Noting()), Call())
+    newest = view.stream.last("/bumper", T0 + 90 * S)
+    assert newest is not None
+    assert newest.time == T0 + 1
+    assert max(window.stop for window in windows) == T0 + 2
