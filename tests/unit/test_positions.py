@@ -1,5 +1,6 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -308,3 +309,14 @@ def test_coordinates_and_a_place_of_one_name_are_two_rows(
     }
     rows = [row[0] for row in asked(memory, "visits", where=where, by="place")["rows"]]
     assert [name for name in rows if name in both] == [*names]
+
+
+def test_of_several_topics_of_poses_the_refusal_says_which_is_best(tmp_path: Path) -> None:
+    """Of two filters of robot_localization, the one in the map follows a satellite receiver."""
+    poses = [replace(odom(T0), topic=topic) for topic in ("/odometry/global", "/odometry/local")]
+    refused = asked(remembered(tmp_path, poses), "get_position_at", timestamp=T0_S)
+    assert refused["detail"].endswith(
+        "poses are on /odometry/global (nav_msgs/msg/Odometry), /odometry/local "
+        "(nav_msgs/msg/Odometry): set data.pose_topic to one of them (best to odometry that no "
+        "localisation corrects), or give topic where the tool takes it"
+    )

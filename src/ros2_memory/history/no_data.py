@@ -49,6 +49,11 @@ _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|pl
 """Matches names of topics whose poses are not the robot's."""
 MOST_TRIED: Final = 20
 """At most this many topics of unmapped types are looked into for poses."""
+_BEST_POSES: Final = {
+    "position": " (best to odometry that no localisation corrects)",
+    "velocity": "",
+}
+"""Corrections move a robot that stands, and are not distinguished from a path."""
 _NEAR_NS: Final = 60 * NS_PER_S
 """A message that is older by no more may stand in for a missing one."""
 _CLOCKS_DIFFER_NS: Final = 60 * NS_PER_S
@@ -144,7 +149,7 @@ def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None
         topics = unmapped_topics_with(view)
     if topics:
         name, _, _ = topics[0].partition(" ")
-        value = f"={name}" if len(topics) == 1 else " to one of them"
+        value = f"={name}" if len(topics) == 1 else f" to one of them{_BEST_POSES[what]}"
         return f"; {those} are on {listed(topics)}: set data.pose_topic{value}, or {GIVE_TOPIC}"
     if what == "position" and (
         fixes := topics_with(view, "geodetic") or unmapped_topics_with(view, "geodetic")
