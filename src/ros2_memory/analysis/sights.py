@@ -99,10 +99,12 @@ Beside = IntEnum("Beside", "SPOT LABEL N", start=0)
 Unplaced = IntEnum("Unplaced", "SLICE TOPIC LABEL N FIRST LAST", start=0)
 """Columns of `Sights.unplaced`: detections of a label without a place."""
 
-Fix = IntEnum("Fix", "SLICE TIME X Y YAW SIGMA", start=0)
-"""Columns of `Sights.fixes`: where odometry was in the map, and how exactly that was known.
+Fix = IntEnum("Fix", "SLICE TIME JUMP SIGMA", start=0)
+"""Columns of `Sights.fixes`: how well it was known where the robot was in the map.
 
-`SIGMA` is what the localiser says, for a point `AHEAD_MM` before the robot; -1 if it does not.
+Both are of a point `AHEAD_MM` before the robot, in mm: `JUMP` how far the map moved it under
+odometry since the fix before, `SIGMA` its standard deviation as the localiser states it; -1 if it
+does not.
 """
 
 AHEAD_MM: Final = 2_000
@@ -147,7 +149,7 @@ class Sights:
         scores: how high the scores of spots were (`Score`).
         beside: which other labels were beside a spot in the same message (`Beside`).
         unplaced: detections without a place (`Unplaced`).
-        fixes: where odometry was in the map (`Fix`).
+        fixes: how well it was known where the robot was in the map (`Fix`).
     """
 
     topics: tuple[str, ...]
@@ -217,18 +219,18 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     return Sights((topic,), labels, *tables)
 
 
-def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
-    """Returns sights with fixes alone: where odometry was in the map.
+def fixes_of(times: Ints, jumps_m: Floats, sigma_m: Floats) -> Sights:
+    """Returns sights with fixes alone: how well it was known where the robot was in the map.
 
     Args:
         times: log times (ns).
-        poses: for each time, x, y (m) and yaw (rad) of odometry in the map.
+        jumps_m: for each time, `Fix.JUMP`.
         sigma_m: for each time, `Fix.SIGMA` as the localiser states it; NaN if it does not.
     """
     sigma_mm = np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)
     sigmas = np.rint(sigma_mm).astype(np.int64)
-    x, y, yaw = poses.T
-    columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), sigmas)
+    jumps = _mm(np.minimum(jumps_m, _MAX_AWAY_M))
+    columns = (times // SLICE_NS, _rounded(times), jumps, sigmas)
     empty = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
     return Sights((), (), *(*empty, np.stack(columns, axis=1)))
 

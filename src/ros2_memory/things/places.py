@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
-from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Look, Spot
+from ros2_memory.analysis.sights import Beside, Fix, Look, Spot
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
@@ -534,7 +534,7 @@ def _turns(spots: Ints, n: Ints, is_other: Ints) -> tuple[int, int]:
 _POOR_MM: Final = 600
 """Standard deviation of a point `AHEAD_MM` before the robot, above which localisation is poor."""
 _JUMP_MM: Final = 300.0
-"""A jump moves that point by more in the map."""
+"""A jump moves that point by more in the map, without odometry."""
 _BEFORE_NS: Final = 5 * NS_PER_S
 _NEXT_NS: Final = 4 * NS_PER_S
 _NEVER_NS: Final = 3600 * NS_PER_S
@@ -563,9 +563,7 @@ def _poor_times(fixes: Columns) -> tuple[Ints, Ints]:
     time = fixes[:, Fix.TIME]
     after = np.diff(time, append=time[-1:] + _NEVER_NS)
     after[after < 0] = _NEVER_NS  # the next one is of another session
-    turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
-    off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
-    jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
+    jumped = np.flatnonzero((fixes[:, Fix.JUMP][1:] > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
     # The last covariance that the localiser gave before each fix, unless it is too old.
     sigma = fixes[:, Fix.SIGMA]
     is_new = sigma >= 0

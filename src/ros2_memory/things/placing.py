@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import FrameTree, Rotations
+from ros2_memory.analysis.frames import FramePoses, FrameTree, Rotations
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
 from ros2_memory.analysis.sights import (
@@ -134,7 +134,7 @@ class Placer:
         ]
         if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([messages.log_times for messages in messages_of_topics.values()])
-            sights.append(self._fixes(session, poses.frames.words[0], frames, times))
+            sights.append(self._fixes(session, poses, frames, times))
         return PlacedSights(target, sights, detectors)
 
     def sights_by_bag(
@@ -186,7 +186,7 @@ class Placer:
 
     def _poses(self, session: Session, lender: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
-        around = window.widened(2 * _NEAR_NS)
+        around = window.widened(AROUND_NS)
         if self.body is None:
             poses = self._recorded_poses(session, around)
         else:
@@ -228,8 +228,8 @@ class Placer:
             return target, frames
         return pose_frame, frames_over(self._view, lender, window, pose_frame)
 
-    def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Sights:
-        """Returns the poses of odometry in the map around detections, wherever these poses change.
+    def _fixes(self, session: Session, poses: Poses, frames: FrameTree, detected: Ints) -> Sights:
+        """Returns how well it was known where the robot was around detections.
 
         `detected` has the log times (ns) of the detections.
         """
@@ -237,23 +237,23 @@ class Placer:
         around = TimeWindow(begin, end).widened(AROUND_NS)
         said_at, said = self._localiser_sigmas(session, around)
         times, step = _fix_times(begin, end + _AHEAD_NS)
-        pose = np.zeros((len(times), 3))
-        poses = frames.poses(odometry, times) if odometry != frames.target else None
-        if poses is not None:
-            x, y, _ = poses.translation
-            pose = np.stack((x, y, _yaw(poses.rotation)), axis=1)[poses.valid]
-            times = times[poses.valid]
+        jumps = np.zeros(len(times))
+        odometry = poses.frames.words[0]
+        placed = frames.poses(odometry, times) if odometry != frames.target else None
+        if placed is not None:
+            times = times[placed.valid]
+            jumps = _jumps_ahead(placed, poses, times)
         elif not len(said):
-            return fixes_of(times[:0], pose[:0], said)
+            return fixes_of(times[:0], jumps[:0], said)
         sigma = np.append(said, [math.nan])[np.searchsorted(said_at, times, side="right") - 1]
-        is_changed = np.abs(np.diff(pose, axis=0)).max(axis=1, initial=0.0) > _SAME_M
+        is_changed = jumps[1:] > _SAME_M
         is_changed |= np.abs(np.diff(np.nan_to_num(sigma, nan=-1.0))) > _SAME_M
         # The fixes on both sides of a change, and in any case one in each slice of the clock.
         is_needed = times // SLICE_NS != (times - step) // SLICE_NS
         is_needed[1:] |= is_changed
         is_needed[:-1] |= is_changed
         is_needed &= (times >= begin - step) & (times <= end + _AHEAD_NS)
-        return fixes_of(times[is_needed], pose[is_needed], sigma[is_needed])
+        return fixes_of(times[is_needed], jumps[is_needed], sigma[is_needed])
 
     def _localiser_sigmas(self, session: Session, window: TimeWindow) -> tuple[Ints, Floats]:
         """Returns when localisers gave their covariance (ns), and its standard deviation (m).
@@ -299,6 +299,30 @@ def _fix_times(first: Ns, last: Ns) -> tuple[Ints, Ns]:
     most = MAX_NS // step
     begin, end = max(first // step - 1, -most), min(last // step + 2, most)
     return np.arange(begin, end) * step, step
+
+
+def _jumps_ahead(placed: FramePoses, poses: Poses, times: Ints) -> Floats:
+    """Returns how far (m) the map moved a point `AHEAD_MM` before the robot since the time before.
+
+    What the robot drove does not count: the point is where odometry had it at the earlier time.
+
+    Args:
+        placed: odometry's frame in the map.
+        poses: the robot's poses in odometry's frame.
+        times: those of `placed` at which it is valid (ns).
+    """
+    jumps = np.zeros(len(times))
+    if len(times) < 2:
+        return jumps
+    yaw = _yaw(placed.rotation)[placed.valid]
+    origin_x, origin_y = (axis[placed.valid] for axis in placed.translation[:2])
+    turn = np.remainder(np.diff(yaw) + np.pi, 2 * np.pi) - np.pi
+    x, y = (np.interp(times[:-1], poses.times, poses.positions[:, axis]) for axis in (0, 1))
+    cos, sin = np.diff(np.cos(yaw)), np.diff(np.sin(yaw))
+    moved_x = np.diff(origin_x) + cos * x - sin * y
+    moved_y = np.diff(origin_y) + sin * x + cos * y
+    jumps[1:] = np.hypot(moved_x, moved_y) + AHEAD_MM / 1000 * np.abs(turn)
+    return jumps
 
 
 def _sights_of(topic: str, messages: Detected, frames: FrameTree, robot: Floats) -> Sights:

@@ -11,7 +11,19 @@ import pytest
 from ros2_memory.core.arrays import Ints
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.things.places import Sightings, stays_in
-from tests.support.bags import Msg, header, make, point, quaternion, write_mcap, write_splits
+from tests.support.bags import (
+    Msg,
+    detected,
+    header,
+    make,
+    odom,
+    point,
+    quaternion,
+    tf,
+    transform,
+    write_mcap,
+    write_splits,
+)
 from tests.support.memories import asked, each_way, memory_of
 from tests.unit.things.test_find import (
     BEGIN,
@@ -221,6 +233,36 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     reply = ask(tmp_path, "compare", start=BEGIN + 90, end=BEGIN + stop, **windows)
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
+    assert ("localisation was poor" in str(reply.get("notes"))) == is_poor
+
+
+def corrected(at_s: float, robot: tuple[float, float, float], turn: float) -> list[Msg]:
+    """The robot, 60 m from the origin of its odometry, in a map that is turned about the robot."""
+    at = BEGIN * S + round(at_s * S)
+    x, y, yaw = robot
+    cos, sin = math.cos(turn), math.sin(turn)
+    origin = (x - 60.0 * cos, y - 60.0 * sin, 0.0)
+    pose = transform(at, "odom", "base_link", (60.0, 0.0, 0.0), yaw - turn)
+    return [
+        odom(at, 60.0, 0.0, yaw - turn),
+        tf(at, transform(at, "map", "odom", origin, turn), pose),
+    ]
+
+
+@pytest.mark.parametrize(("turn", "is_poor"), [(0.012, False), (0.25, True)])
+def test_a_small_turn_of_the_map_far_from_the_origin_of_odometry_is_no_jump(
+    tmp_path: Path, turn: float, is_poor: bool
+) -> None:
+    """Localisers correct the heading all the time; what counts is how far the robot moves by it."""
+    seen = [("mug", 0.9, (2.0, 0.5, 0.7)), ("book", 0.9, (2.5, -1.0, 0.7))]
+    moved = [(label, score, (x, y + 0.4, z)) for label, score, (x, y, z) in seen]
+    messages: list[Msg] = []
+    for at in [*range(30), *range(90, 120)]:
+        messages += corrected(at, HERE, turn if at > 60 and at % 4 < 2 else 0.0)
+        messages.append(detected(BEGIN * S + at * S, seen if at < 60 else moved))
+    write_splits(tmp_path, messages)
+    reply = ask(tmp_path, "find_things")
+    assert ["moved" in thing for thing in reply["things"]] == [not is_poor] * 2
     assert ("localisation was poor" in str(reply.get("notes"))) == is_poor
 
 
