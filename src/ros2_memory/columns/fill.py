@@ -378,10 +378,14 @@ class Filling:
                 self._large.release()
 
     def _share(self, bags: Sequence[BagFile]) -> int:
-        """Returns how many bytes the columns of some bags may take."""
+        """Returns how many bytes the columns of some bags may take.
+
+        By their length at most as many as the bags have: years may lie between two messages.
+        """
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
-        return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
+        by_length = min(self._limits.least_bytes_per_s * length, size)
+        return max(round(self._limits.max_share * size), by_length)
 
     def _may_be_stored(self, bag: BagFile) -> bool:
         return not self._reader.is_file(bag.path) or is_settled(

@@ -122,6 +122,21 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
     assert check_all(world) == 901
 
 
+def test_a_bag_in_which_the_clock_was_set_ahead_by_years_fits_into_a_cache_folder(
+    tmp_path: Path,
+) -> None:
+    """A computer without a battery dates its first messages years before the others of the file."""
+    bag_dir = tmp_path / "bags"
+    years = 7 * 365 * 86_400 * S
+    messages = [odom(at + n * S, n / 10, 0.0) for at in (T0 - years, T0) for n in range(60)]
+    path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
+    os.utime(path, ns=(T0, T0))
+    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite", limits=StoreLimits())
+    world.fill()
+    assert world.stored() == {"rec/rec_0.mcap"}
+    assert times(world, "/odom") == times(world.unstored(), "/odom")
+
+
 def decode_in_groups(patch: pytest.MonkeyPatch) -> None:
     """Has bags decoded in several goes, as those of many gigabytes are."""
     patch.setattr(decode, "GROUP_BYTES", 1)
