@@ -74,6 +74,17 @@ def rounded(number: float, places: int) -> float | None:
     return round(number, places) if math.isfinite(number) else None
 
 
+def rounded_beside(number: float, largest: float) -> float:
+    """Returns a finite number of unknown unit with six decimals, or more if all are tiny.
+
+    Args:
+        number: to be rounded.
+        largest: the largest absolute number beside it, which keeps five digits.
+    """
+    exponent = math.floor(math.log10(largest)) if largest else 0
+    return round(number, max(6, 4 - exponent))
+
+
 def degrees(angle: float | None) -> float | None:
     """Returns an angle (rad) in degrees, or None."""
     return None if angle is None else rounded(math.degrees(angle), 2)
@@ -514,6 +525,8 @@ LOCAL_OF_DAYS: Final = Unit(_local_of_days)
 SECONDS: Final = unit(seconds, "_s")
 TENTHS_OF_S: Final = unit(lambda duration: round(seconds(duration), 1), "_s")
 MINUTES: Final = unit(lambda duration: round(duration / 60e9, 2))
+NUMBER: Final = unit(lambda pair: rounded_beside(*pair))
+"""A number of unknown unit, behind it the largest one beside it."""
 AGO: Final = Unit(_ago, takes_none=True)
 TENTHS_OF_S_AGO: Final = Unit(_tenths_ago)
 YAW: Final = Unit(lambda angle, _: {"yaw_deg": degrees(angle)}, is_spread=True, takes_none=True)

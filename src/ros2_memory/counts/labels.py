@@ -25,6 +25,7 @@ from ros2_memory.analysis.intervals import (
     visible_in,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import listed, named
 from ros2_memory.counts.bins import HELD_COLUMNS
@@ -218,7 +219,7 @@ def _row(intervals: Sequence[VisibleInterval], elapsed: Elapsed, most_at_once: i
         elapsed.among(spans),
         spans[0][0] if spans else None,
         spans[-1][1] if spans else None,
-        max(scores, default=None),
+        rounded(max(scores), 6) if scores else None,
         most_at_once,
     )
 

@@ -23,6 +23,7 @@ from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.arrays import range_numbers
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import rounded_beside
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
@@ -596,5 +597,9 @@ def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _FieldC
     mean = float(f"{total / sum(part.size for part in parts) / SUM_SCALE:.{_MEAN_DIGITS}g}")
     # A sum of rounded numbers may put the mean beside the exact extremes.
     mean = min(max(mean, least_number), greatest_number)
+    largest = max(abs(least_number), abs(greatest_number))
+    low, high, middle = (
+        rounded_beside(number, largest) for number in (least_number, greatest_number, mean)
+    )
     # Plus 0 makes -0.0 positive, which replies show as 0.
-    return _FieldCell(least_number + 0, least_at, greatest_number + 0, greatest_at, mean + 0.0)
+    return _FieldCell(low + 0, least_at, high + 0, greatest_at, middle + 0.0)

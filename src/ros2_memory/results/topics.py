@@ -11,6 +11,7 @@ from ros2_memory.core.reply import (
     LOCAL,
     MESSAGE,
     NAME,
+    NUMBER,
     OBJECT,
     OBJECTS,
     PAIRS,
@@ -93,9 +94,9 @@ class TopicValue(AnswerWithNotes):
 
 
 @result(
-    digits(6)("min", "least"),
+    NUMBER("min", "least", "largest"),
     TIME("min_at", "least_at"),
-    digits(6)("max", "most"),
+    NUMBER("max", "most", "largest"),
     TIME("max_at", "most_at"),
     LOCAL("min_local", "least_at", "least_at"),
     LOCAL("max_local", "most_at", "most_at"),
@@ -108,6 +109,11 @@ class Extremes:
     least_at: Ns
     most: float
     most_at: Ns
+
+    @property
+    def largest(self) -> float:
+        """The largest absolute number of the two."""
+        return max(abs(self.least), abs(self.most))
 
 
 def _first_time(answer: TopicRange) -> Ns | None:
@@ -387,7 +393,7 @@ class Sightings(AnswerWithNotes):
 
 BinColumn: TypeAlias = Literal["count", "duration", "minutes", "metres", "number", "time"]
 """The kind of the values of a column: whole numbers, nanoseconds (shown as seconds or as minutes),
-metres, plain numbers, log times."""
+metres, numbers that are finite and rounded, log times."""
 
 
 def _clock(second: int) -> str:
@@ -493,7 +499,7 @@ def _cell(value: float, kind: BinColumn) -> JsonValue:
         case "metres":
             return rounded(value, 2)
         case "number":
-            return rounded(value, 6)
+            return value
         case "time":
             # To the second, as arguments take it: the Unix time beside it is exact.
             return local_time(int(value) // NS_PER_S * NS_PER_S).isoformat(sep=" ")

@@ -193,3 +193,17 @@ def test_a_field_that_a_topic_has_no_more_is_that_of_its_window(tmp_path: Path) 
     fields = {"fields": ["percentage"]}
     answer = count_range(memory_of(tmp_path), Call(), "/battery_state", span, "hour", **fields)
     assert "percentage holds no number in the window" in answer.notes
+
+
+def test_tiny_numbers_keep_their_digits_and_noise_beside_others_does_not(tmp_path: Path) -> None:
+    """Tesla, and squares of metres; beside 2.5, 1e-17 is nothing."""
+    write_numbers(tmp_path, ("Float64", 2.3456789e-5), ("Float64", -1.23456e-7))
+    given = {"topic": "/number", "start": T0, "end": T0 + 9, "fields": ["value"]}
+    memory = memory_of(tmp_path)
+    extremes = asked(memory, "get_topic_in_range", **given)["extremes"]["value"]
+    assert (extremes["min"], extremes["max"]) == (-1.23e-7, 2.3457e-5)
+    row = table(asked(memory, "get_topic_in_range", **given, by="hour"))["all"]
+    assert (row["value.min"], row["value.max"]) == (-1.23e-7, 2.3457e-5)
+    assert row["value.mean"] == pytest.approx(1.1667e-5)
+    write_numbers(tmp_path, ("Float64", 2.5), ("Float64", 1e-17))
+    assert asked(memory, "get_topic_in_range", **given)["extremes"]["value"]["min"] == 0.0
