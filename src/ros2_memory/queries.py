@@ -59,7 +59,7 @@ from ros2_memory.history.driven_path import (
     newest_of_body,
     resolve_path_topic,
 )
-from ros2_memory.history.held_values import still_holds
+from ros2_memory.history.held_values import newest_stating, still_holds
 from ros2_memory.history.no_data import (
     decode,
     describe_lack,
@@ -156,6 +156,8 @@ def topic_value(
     """
     view, at, now = open_moment(memory, call, moment)
     stored = _newest_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
+    window, _ = _window_before(view, at, tolerance_s, moment.rest_s)
+    stored = newest_stating(view, stored, fields, window.start)
     value = _as_value(view, stored, fields, now)
     return _with_latched_age(view, value, stored, at)
 
@@ -474,6 +476,7 @@ def _value_at_match(
         days.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
         notes = (*matched.notes, *days.notes.sentences())
         return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
+    stored = newest_stating(view, stored, fields, MIN_NS)
     since_value = replace(until_match, start=stored.time)
     for shown_days in dict.fromkeys((days, view)):
         note_unread(shown_days, since_value)

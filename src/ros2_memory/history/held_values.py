@@ -384,6 +384,37 @@ def is_text(view: View, topic: str) -> bool:
     return set(view.timeline.types_of(topic)) == {TEXT}
 
 
+def newest_stating(
+    view: View, stored: StoredMessage, fields: Sequence[str], since: Ns
+) -> StoredMessage:
+    """Returns the newest message from a log time up to `stored` that says something of a field.
+
+    `stored` itself, unless it names other joints than the fields do: several nodes may publish
+    those of one robot.
+    """
+    if not fields or _says_something(view, stored, fields):
+        return stored
+    window = TimeWindow(since, stored.time + 1)
+    messages = view.stream.messages([stored.topic], window, newest_first=True)
+    for earlier in islice(messages, _MOST_TRIED):
+        is_alike = earlier.bag.recording == stored.bag.recording
+        if is_alike and _says_something(view, earlier, fields):
+            return earlier
+    return stored
+
+
+def _says_something(view: View, stored: StoredMessage, fields: Sequence[str]) -> bool:
+    """Whether a message says something of a field; True if it cannot be decoded."""
+    message, type_name = view.bags.decode(stored), stored.type
+    extractor = view.extractor
+    if message is None or any(
+        extractor.exact_at(message, type_name, field) is not None for field in fields
+    ):
+        return True
+    value = extractor.exact(message, type_name)
+    return not all(names_others(value, field) for field in fields)
+
+
 def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = False) -> Ns:
     """Returns until when the message of a topic at `last` held (log time, ns), at most `end`.
 
