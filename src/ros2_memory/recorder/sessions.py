@@ -517,6 +517,7 @@ class RecordingSessions:
                 # An incomplete one is settled later: the old recording counts up to its end.
                 if handover.complete(now):
                     self._completed[handover.old.name] = handover
+                    handover.new.is_beside = False
             self._unsettled.append(handover.directories)
         for session in self.running:
             session.end()
