@@ -13,6 +13,7 @@ from typing import Annotated, Final, NamedTuple, TypeVar, cast
 
 import typer
 
+from ros2_memory.bag_dir.layout import is_derived
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import answer_to
 from ros2_memory.cli.export import Definitions, write_mcap
@@ -165,24 +166,38 @@ class _ReadLog:
 
 
 class _Part(NamedTuple):
-    """A part of a recording without a gap."""
+    """A part of a recording without a gap, or a bag with what stays of deleted ones."""
 
     recording: Path
     window: TimeWindow
+    derived: str = ""
+    """The name of that bag, by which it is known."""
+
+    def has(self, stored: StoredMessage) -> bool:
+        """Whether a message in its window is of it."""
+        bag = stored.bag
+        derived = bag.path.name if is_derived(bag.path) else ""
+        return (bag.recording, derived) == (self.recording, self.derived)
 
 
 def _parts_without_gaps(view: View) -> list[_Part]:
-    """Returns all recordings, each divided at the gaps of the memory."""
+    """Returns all recordings, each divided at the gaps of the memory, and derived bags."""
     spans: dict[Path, Span] = {}
-    for bag in view.timeline.recorded:
+    derived: list[_Part] = []
+    for bag in view.timeline.bags:
+        if is_derived(bag.path):
+            window = TimeWindow(bag.start, bag.end + 1)
+            derived.append(_Part(bag.recording, window, bag.path.name))
+            continue
         start, stop = spans.get(bag.recording, (MAX_NS, MIN_NS))
         spans[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)
     gaps = [(before + 1, after) for before, after in view.snapshot.gaps]
-    return [
+    recorded = [
         _Part(recording, TimeWindow(start, stop))
         for recording, span in spans.items()
         for start, stop in without([span], gaps)
     ]
+    return recorded + derived
 
 
 def _spans_to_copy(
@@ -194,9 +209,10 @@ def _spans_to_copy(
     recorded.
     """
     topics = view.timeline.topics()
-    ends = sorted(at for part in parts for at in (part.window.start, part.window.stop - 1))
+    ends = [at for part in parts for at in (part.window.start, part.window.stop - 1)]
     if in_one_file:  # there is nothing between recordings
-        ends = [ends[0], ends[-1]]
+        recorded = view.timeline.recorded
+        ends = [min(bag.start for bag in recorded), max(bag.end for bag in recorded)]
     moments = [(at, at + 1) for at in ends]
     return [
         {topic: united([*read.get(topic, ()), *moments]) for topic in topics},
@@ -224,13 +240,9 @@ def _write_copy(
     for number, part in enumerate(parts):
         folder = path / part.recording.relative_to(view.bag_dir)
         folder.mkdir(parents=True, exist_ok=True)
-        messages = (
-            stored
-            for stored in _messages_in(view, spans, part.window)
-            if stored.bag.recording == part.recording
-        )
+        messages = filter(part.has, _messages_in(view, spans, part.window))
         with suppress(NoDataError):  # all messages of the part are copies of another recording's
-            file = folder / f"{part.recording.name}_{number}.mcap"
+            file = folder / (part.derived or f"{part.recording.name}_{number}.mcap")
             count += write_mcap(file, definitions.add_to(messages))
     return count
 

@@ -92,6 +92,26 @@ def test_what_lay_between_recordings_needs_a_folder(
     assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
 
 
+@pytest.mark.parametrize(
+    "question",
+    [
+        f"get_position_at timestamp={BEGIN // S - DAY_S + 50}",
+        "find_last_match topic=/mode condition_type=contains value=idle",
+        "list_recorded_topics",
+    ],
+)
+def test_a_folder_has_what_stays_of_deleted_bags_under_its_names(
+    two_days: Path, tmp_path: Path, exits: Program, question: str
+) -> None:
+    path = [odom(BEGIN + (2 * nth - DAY_S) * S, nth / 5, 0.0) for nth in range(100)]
+    write_mcap(two_days / "memory" / "20260713.thinned.mcap", path)
+    latched = McapLayout(latched=frozenset({"/mode"}))
+    carried = [text(BEGIN - 20 * DAY_S * S, "idle", "/mode")]
+    write_mcap(two_days / "latched" / "carried.mcap", carried, latched)
+    proof = tmp_path / "proof"
+    assert "the same answer" in exits(0, "prove", question, "-o", proof, two_days).err
+
+
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "bags").mkdir()
     refused = exits(2, f"prove 'visits x=1 y=1' -o {tmp_path}/proof {tmp_path}/bags")
