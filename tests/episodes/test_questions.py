@@ -1,7 +1,6 @@
 """A hundred questions about a month that no reply holds are answered rightly, in one call each."""
 
 import os
-import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby, pairwise
@@ -29,7 +28,7 @@ from tests.episodes.questions import (
 )
 from tests.episodes.world import ACTION, DAYS, NOW, TASK, US_PER_S, day_start, month
 from tests.support.bags import Msg, make, text, write_mcap
-from tests.support.clocks import SettableClock
+from tests.support.clocks import SettableClock, in_zone
 from tests.support.memories import asked, memory_of, with_store
 
 pytestmark = pytest.mark.xdist_group("episodes")
@@ -139,12 +138,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def in_utc(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with monkeypatch.context() as patched:
-        patched.setenv("TZ", "UTC")
-        time.tzset()
+def in_utc() -> Iterator[None]:
+    with in_zone("UTC"):
         yield
-    time.tzset()
 
 
 def over(folder: Path) -> Memory:
