@@ -157,6 +157,17 @@ def test_a_joint_holds_its_value_while_another_publisher_names_others(
     held = [(row["seconds"], row["value"]) for row in lift(changes=True)["changes"]]
     assert held == [(6.0, 0), (4.0, 0.5)]
     assert [row[:3] for row in lift(by="value")["rows"]] == [["0", 1, 6.0], ["0.5", 1, 4.0]]
+    then = {"topic": "/joints", "timestamp": T0 / NS_PER_S + 7, "fields": ["positions.lift"]}
+    for tolerance_s, lifted in ((2.0, 0.5), (0.5, None)):  # beyond it nothing says it
+        at_time = asked(memory, "get_topic_at_time", **then, tolerance_s=tolerance_s)
+        assert at_time["value"] == {"positions.lift": lifted}
+    bent = {"condition_type": "above", "field": "positions.elbow", "value": 0.3}
+    topics = {"condition_topic": "/joints", "value_topic": "/joints"}
+    found = asked(memory, "get_value_when", **topics, **bent, fields=["positions.lift"])
+    assert (found["value"], found["value_timestamp"]) == (
+        {"positions.lift": 0.5},
+        T0 / NS_PER_S + 10,
+    )
 
 
 def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path) -> None:
@@ -169,15 +180,3 @@ def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path
         assert reply["extremes"]["position.elbow"]["max"] == 0.4
         by_hour = asked(memory, "get_topic_in_range", fields=["position.elbow"], by="hour", **given)
         assert by_hour["all"][by_hour["columns"].index("position.elbow.max") - 1] == 0.4
-
-    then = {"topic": "/joints", "timestamp": T0 / NS_PER_S + 7, "fields": ["positions.lift"]}
-    for tolerance_s, lifted in ((2.0, 0.5), (0.5, None)):  # beyond it nothing says it
-        at_time = asked(memory, "get_topic_at_time", **then, tolerance_s=tolerance_s)
-        assert at_time["value"] == {"positions.lift": lifted}
-    bent = {"condition_type": "above", "field": "positions.elbow", "value": 0.3}
-    topics = {"condition_topic": "/joints", "value_topic": "/joints"}
-    found = asked(memory, "get_value_when", **topics, **bent, fields=["positions.lift"])
-    assert (found["value"], found["value_timestamp"]) == (
-        {"positions.lift": 0.5},
-        T0 / NS_PER_S + 10,
-    )
