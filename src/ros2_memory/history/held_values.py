@@ -142,8 +142,13 @@ class HeldValues:
             if message is None:
                 return
             value = self._value_of(message, newest.type)
-            if not self._is_unstated(value, message, newest.type):
-                break
+            if self._is_unstated(value, message, newest.type):
+                continue
+            if value is None and self._field is not None:
+                # Null is a value, as behind the end of a list, unless there is no such field.
+                self._view.extractor.shown(message, newest.type, [self._field])
+                return
+            break
         if newest is not None and isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             raise InvalidArgumentsError(

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -426,3 +427,21 @@ def test_of_more_episodes_than_are_counted_the_newest_are(
     assert (reply["start"], table(reply)["all"]["count"]) == (T0 + 80, 2)
     [note] = [each for each in reply["notes"] if "is counted" in each]
     assert note.endswith("is counted: more than 2 episodes; ask about a shorter window")
+
+
+@each_way
+def test_a_field_that_is_null_now_has_the_values_that_it_held(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """Nothing is in view at the end, as at the begin."""
+    seen = [detections(BEGIN + n * S, ["cup"] * (3 <= n < 7)) for n in range(12)]
+    memory = remembered(tmp_path, seen, recalls=recalls)
+    given = {"topic": "/vision/scene/scene_objects", "start": T0, "end": T0 + 11}
+    ask = partial(asked, memory, "get_topic_in_range", **given)
+    changes = ask(fields=["detections.0.label"], changes=True)["changes"]
+    assert [(row["value"], row["seconds"]) for row in changes] == [
+        (None, 3.0),
+        ("cup", 4.0),
+        (None, 4.0),
+    ]
+    assert "has no field 'labels'" in ask(fields=["labels"], changes=True)["detail"]
