@@ -270,7 +270,8 @@ def _label_held(
         seen = read_labels(view, topics, scope, condition, matches)
         visible, since = seen.visible, seen.since
     else:
-        events, since = _events_in_order(view, topics[0], binned.counted)
+        # What was in view just before the window does not begin in it.
+        events, since = _events_in_order(view, topics[0], binned.counted.widened(FLICKER_NS))
         visible = _visible_by_events(events, matches)
         if visible.size:
             _note_uncounted(view, topics[0], events)
@@ -285,7 +286,8 @@ def _label_held(
     spans = united(
         ((interval.first, interval.last) for interval in visible.intervals()), FLICKER_NS
     )
-    return SightingSpans(held_spans((first, last, True) for first, last in spans), since)
+    start = binned.counted.start
+    return SightingSpans(held_spans((first, last, first >= start) for first, last in spans), since)
 
 
 def _visible_by_events(

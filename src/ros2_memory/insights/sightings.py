@@ -359,6 +359,10 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
         return SightingSpans(spans[:known], int(firsts[known - 1]))
     if searched_runs.is_over:
         return SightingSpans(spans, int(firsts[-1]))
+    for nth, topic in enumerate(topics):
+        own = np.flatnonzero(searched_runs.table[:, 0] == nth)
+        if own.size and not (is_log[nth] or scope.is_bounded):
+            are_begun[own[-1]] = not _matched_before(view, search, topic, int(firsts[own[-1]]))
     start, end = scope.window.asked()
     earlier = [
         (first, last, False)
@@ -367,6 +371,12 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
         for first, last in scope.parts_of(start, held_until(view, topic, start, end))
     ]
     return SightingSpans(np.concatenate((spans, held_spans(earlier))))
+
+
+def _matched_before(view: View, search: ReverseSearch, topic: str, first: Ns) -> bool:
+    """Returns whether a run of matches goes on from a match before what was searched."""
+    before = view.stream.last(topic, first)
+    return before is not None and first - before.time <= SILENCE_NS and bool(search.matches(before))
 
 
 def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, Ns, bool]]:

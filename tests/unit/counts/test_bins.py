@@ -220,6 +220,33 @@ def test_a_text_that_holds_through_a_gap_has_no_row_for_hours_without_recording(
     assert "no rows for times in which nothing was recorded: 09:00 to 10:00" in reply["notes"]
 
 
+@each_way
+@pytest.mark.parametrize("topic", [SEEN, "/state"])
+def test_what_goes_on_from_before_a_window_counts_where_it_began(
+    tmp_path: Path, topic: str, recalls: bool
+) -> None:
+    """A person is in view from 60 to 130 s and from 150 to 160 s, missed for 2 s now and then."""
+    messages = []
+    for second in range(200):
+        at = (BEGIN + second) * S
+        is_there = 60 <= second < 130 or 150 <= second < 160
+        is_seen = is_there and (topic != SEEN or second not in {100, 101})
+        words = ["person"] if is_seen else []
+        messages += [odom(at), detections(at, words), text(at, str(words), "/state")]
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    asks = {"topic": topic, "condition_type": "contains", "value": "person", "by": "day"}
+
+    def counted(first: float, last: float) -> tuple[int, float | None]:
+        span = {"start": BEGIN + first, "end": BEGIN + last}
+        whole = table(asked(memory, "find_matches", **asks, **span))["all"]
+        return whole["count"], whole["first_unix"] and whole["first_unix"] - BEGIN
+
+    assert counted(0, 199) == (2, 60)
+    assert counted(0, 100.5) == (1, 60)
+    assert counted(100.5, 199) == (1, 150)
+    assert counted(90.5, 120) == (0, None)
+
+
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
 
