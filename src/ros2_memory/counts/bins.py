@@ -463,8 +463,9 @@ class BinnedWindow:
     def _is_first_day_cut(self) -> bool:
         """Returns whether the first local day has something recorded before the window."""
         start = self.window.start
-        start_s = start // NS_PER_S
-        before = TimeWindow((start_s - _local_s(start_s) % _DAY_S) * NS_PER_S, start)
+        # On the day of a change of clocks midnight is not as long ago as the clock says.
+        *_, midnight = _piece_starts(TimeWindow(start - 2 * _DAY_S * NS_PER_S, start + 1), _DAY_S)
+        before = TimeWindow(midnight, start)
         first, last = shown_span(self.view.snapshot, before)
         unrecorded = length_in([*recording_gaps(self.view, before)], first, last)
         # The memory's own start was rounded to be asked for: up to a second is not recorded.

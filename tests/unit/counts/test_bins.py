@@ -247,6 +247,19 @@ def test_what_goes_on_from_before_a_window_counts_where_it_began(
     assert counted(90.5, 120) == (0, None)
 
 
+def test_the_evening_before_clocks_go_forward_is_no_part_of_the_next_day(tmp_path: Path) -> None:
+    with zone(BERLIN):
+        noon = round(datetime(2026, 3, 29, 12).timestamp())
+        for begin in (noon - 12 * H, noon):  # 23:00 in winter time, and 12:00 in summer time
+            messages = [
+                boolean((begin + at) * S, at >= 10, topic="/is_driving") for at in range(20)
+            ]
+            write_mcap(tmp_path / f"{begin}.mcap", messages)
+        asks = {"topic": "/is_driving", "condition_type": "equals", "value": True, "by": "day"}
+        reply = asked(memory_of(tmp_path), "find_matches", start=noon, end=noon + H, **asks)
+    assert reply["usual_first"]["earliest"] == "12:00:10"
+
+
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
 
