@@ -639,7 +639,11 @@ class SelectArguments(Arguments):
     robot: Annotated[
         str | None, Field(strict=True, description="Its name, or several (a, b); without it, all.")
     ] = None
-    limit: Annotated[int, Field(strict=True, ge=1, le=1000, description="Rows.")] = 100
+    limit: Annotated[
+        int,
+        Field(strict=True, ge=1, le=1000, description="Rows."),
+        BeforeValidator(_as_integer),
+    ] = 100
 
 
 class VisitsArguments(Arguments):
