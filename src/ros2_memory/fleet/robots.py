@@ -66,11 +66,13 @@ class LakeReport(NamedTuple):
         older: the last log time (inclusive) of older days that were not looked at; None if the
             answer is from all days.
         is_alone: whether the lake alone could answer: the robot has no bags of its own here.
+        takes_time: whether an argument of the question can have older days looked at.
     """
 
     latest: Ns | None
     older: Ns | None = None
     is_alone: bool = True
+    takes_time: bool = True
 
     def since(self, begin: Ns) -> LakeReport:
         """Returns the report for an answer that needs nothing before a log time."""
@@ -83,8 +85,8 @@ class LakeReport(NamedTuple):
         if self.older is None:
             return []
         since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
-        do = "an end (or before, or a time) there has them looked at"
-        return [f"the lake has days before {since}, which were not looked at: {do}"]
+        do = ": an end (or before, or a time) there has them looked at" if self.takes_time else ""
+        return [f"the lake has days before {since}, which were not looked at{do}"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -252,7 +252,7 @@ class _FleetQuestion:
         if isinstance(answer, ValueWhen) and answer.value is not None:
             return lake.since(answer.value.sample.time)
         begin = self._since(MIN_NS if lake.latest is None else lake.latest)
-        return lake.since(MIN_NS if begin is None else begin)
+        return lake._replace(takes_time=False) if begin is None else lake.since(begin)
 
 
 def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:

@@ -297,6 +297,13 @@ def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) ->
             assert ("not looked at" in str(found)) is (span in before), span
 
 
+@pytest.mark.parametrize("tool", ["list_frames", "memory_status", "data_time_range"])
+def test_what_takes_no_time_names_days_before_and_asks_for_no_time(robot: Robot, tool: str) -> None:
+    notes = str(asked_alone(robot, tool)["notes"])
+    assert "which were not looked at" in notes
+    assert "an end" not in notes
+
+
 def test_where_the_time_is_short_it_says_how_far_it_looked(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
