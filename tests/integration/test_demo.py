@@ -93,7 +93,7 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     position = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
     falsified = replace(position, arguments={"seconds_ago": 20})
     output: list[str] = []
-    code = run_demo(output.append, [position, falsified], once=True, port=0)
+    code = run_demo(output.append, [position, falsified], once=True, port=0, duration_s=95.0)
     assert code == 1
     assert "WRONG: expected a time 10 s ago" in output[-2]
     assert output[-1] == "1 of 2 answers are right."
