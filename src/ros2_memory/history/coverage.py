@@ -358,7 +358,7 @@ def note_edges(view: View, window: TimeWindow) -> None:
     earliest = snapshot.earliest
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
-        if not any(fault.bag.reaches_into(before) for fault in snapshot.misdated):
+        if not any(fault.reaches_into(before) for fault in snapshot.misdated):
             view.notes.add(f"the memory begins at {unix_text(earliest)}")
     if snapshot.latest is None or not _ends_after(window, snapshot.latest):
         return
@@ -455,7 +455,7 @@ def unread_spans(
         yield f"{HELD_BACK}: {listed(held)}"
     if any(aside.reason != HELD_BACK for aside in active):
         yield _describe_active(snapshot, active, window)
-    faults = [fault for fault in snapshot.misdated if fault.bag.reaches_into(window)]
+    faults = [fault for fault in snapshot.misdated if fault.reaches_into(window)]
     if faults and not nothing:
         yield describe_misdated(faults)
     yield from describe_odd(odd)
@@ -577,8 +577,8 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is None or latest is None:
         return None
-    misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
-    is_misdated = any(bag.reaches_into(asked) for bag in misdated)
+    misdated = (fault for fault in snapshot.dating.faults if fault.misleads)
+    is_misdated = any(fault.reaches_into(asked) for fault in misdated)
     if not is_misdated and (gaps := view.gaps(asked, around=True)):
         return gaps[0]
     segments = snapshot.timeline.segments_in(asked)
@@ -641,12 +641,12 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
     reach = snapshot.earliest, snapshot.latest
     if window.overlaps(*reach):
         return reach
-    misdated = [fault.bag for fault in snapshot.misdated]
-    recordings = {bag.recording for bag in misdated if bag.reaches_into(window)}
+    misdated = snapshot.misdated
+    recordings = {fault.bag.recording for fault in misdated if fault.reaches_into(window)}
     if not recordings:
         return reach
     # The reach is that of whole recordings: it must not depend on where splits end.
-    return enclosing((bag.start, bag.end) for bag in misdated if bag.recording in recordings)
+    return enclosing(fault.span for fault in misdated if fault.bag.recording in recordings)
 
 
 def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:

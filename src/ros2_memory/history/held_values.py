@@ -337,11 +337,11 @@ def breaks_of(view: View, topic: str) -> list[Ns]:
         breaks.update(start for start, _ in snapshot.breaks)
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is not None and latest is not None:
-        bags = [fault.bag for fault in snapshot.misdated]
-        ends_before = [bag.end for bag in bags if bag.end < earliest]
+        spans = [fault.span for fault in snapshot.misdated]
+        ends_before = [end for _, end in spans if end < earliest]
         if ends_before:
             breaks.add(max(ends_before))
-        if any(bag.start > latest for bag in bags):
+        if any(start > latest for start, _ in spans):
             breaks.add(latest)
     return sorted(breaks)
 

@@ -7,6 +7,7 @@ them; but the span of the memory, and its newest moment, are computed without th
     before 2017          the clock was not set; if no bag has another date, it was simulated
     after now            the clock was ahead; if all bags are, this machine's clock is behind
     set back by a day    the side of the step with fewer bags is wrong; of equals the earlier one
+    set ahead by 30 days during a recording: what it has from before that is wrong
 
 A clock that was set back by less is listed and leaves the span as it is. If this machine's own
 clock is before 2017, no date counts as being in the future, and a note says so.
@@ -17,13 +18,16 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, set_back_while_written
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, Span, unix_from_ns
+from ros2_memory.index.holes import FAR_AHEAD_NS
 from ros2_memory.index.segment import in_time
+from ros2_memory.index.split_order import splits_before_set_ahead
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -47,6 +51,7 @@ class FaultyClock(StrEnum):
     UNSET = "unset"
     AHEAD = "ahead"
     SET_BACK = "set back"
+    SET_AHEAD = "set ahead"
     STRAY = "stray"
 
 
@@ -57,9 +62,11 @@ class ClockFault(NamedTuple):
         bag: the bag.
         kind: what is wrong with the clock.
         by: `AHEAD`: how far the last message lies after the present (ns). `SET_BACK`: how far the
-            clock was set back (ns), at least.
+            clock was set back (ns), at least. `SET_AHEAD`: how far it was set (ns), at most.
         before: the bag that was begun before the clock was set back; None if `bag` itself was.
-        misleads: whether the bag is left out of the span of the memory.
+        misleads: whether the bag is left out of the span of the memory; of `SET_AHEAD` what it has
+            from before that.
+        until: `SET_AHEAD`: the log time of the last message before that.
     """
 
     bag: BagFile
@@ -67,6 +74,21 @@ class ClockFault(NamedTuple):
     by: Ns = 0
     before: BagFile | None = None
     misleads: bool = True
+    until: Ns | None = None
+
+    @property
+    def leaves_out_bag(self) -> bool:
+        """Whether the whole bag is left out of the span of the memory."""
+        return self.misleads and self.until is None
+
+    @property
+    def span(self) -> Span:
+        """The first and the last log time that the wrong clock gave."""
+        return self.bag.start, self.bag.end if self.until is None else self.until
+
+    def reaches_into(self, window: TimeWindow) -> bool:
+        """Returns whether the times that the wrong clock gave overlap a window."""
+        return window.overlaps(*self.span)
 
     @property
     def at(self) -> Ns:
@@ -96,11 +118,16 @@ class ClockFault(NamedTuple):
                     f"dated up to {_seconds(self.bag.end)}, {_length(self.by)} after now: "
                     "the clock was ahead"
                 )
-            case FaultyClock.SET_BACK if self.before is not None:
-                name = self.before.path.name
-                return f"the clock was set back by {_length(self.by)} after {name} was begun"
             case FaultyClock.SET_BACK:
-                return set_back_while_written(self.by)
+                after = f"the clock was set back by {_length(self.by)} after "
+                within = set_back_while_written(self.by)
+                return f"{after}{self.before.path.name} was begun" if self.before else within
+            case FaultyClock.SET_AHEAD:
+                when = "after" if self.until is None else "while"
+                return (
+                    f"dated from {_seconds(self.bag.start)} on; {when} it was written, the clock "
+                    f"was set {_length(self.by)} ahead"
+                )
             case FaultyClock.STRAY:
                 return (
                     f"dated {_seconds(self.bag.start)}, a day or more from the rest of its "
@@ -127,7 +154,7 @@ class Dating:
     @property
     def misdated(self) -> frozenset[str]:
         """The paths of the bags that are left out of the span."""
-        return frozenset(fault.bag.file for fault in self.faults if fault.misleads)
+        return frozenset(fault.bag.file for fault in self.faults if fault.leaves_out_bag)
 
     @property
     def ahead_from(self) -> Ns:
@@ -158,11 +185,16 @@ def check_dates(
     limit = max_plausible(now)
     unset: list[ClockFault] = []
     ahead: list[ClockFault] = []
+    set_ahead = _set_ahead(timeline, limit)
     for segment in segments:
         bags = segment.bags
         if segment.first[0] < FIRST_BAGS_NS:
             is_unset = (bags.starts < FIRST_BAGS_NS) & (bags.ends <= limit)
-            unset += [ClockFault(bag, FaultyClock.UNSET) for bag in bags.at(is_unset)]
+            unset += [
+                ClockFault(bag, FaultyClock.UNSET)
+                for bag in bags.at(is_unset)
+                if bag.file not in set_ahead
+            ]
         if segment.latest > limit:
             late = bags.at(bags.ends > limit)
             ahead += [ClockFault(bag, FaultyClock.AHEAD, bag.end - now) for bag in late]
@@ -175,17 +207,56 @@ def check_dates(
         unset = []  # a simulated clock, or a robot that has none
     if now < FIRST_BAGS_NS and any(segment.latest >= FIRST_BAGS_NS for segment in segments):
         note = "the clock of this machine is not set: bags are dated years after now"
-    faults = [*unset, *ahead]
+    faults = [*unset, *ahead, *(fault for fault, _ in set_ahead.values())]
     faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
-    if len({fault.bag.file for fault in faults if fault.misleads}) == total:
+    if len({fault.bag.file for fault in faults if fault.leaves_out_bag}) == total:
         faults = [fault._replace(misleads=False) for fault in faults]
     dated = dated_segments(timeline, faults)
     return Dating(
-        earliest=dated[0].first[0] if dated else None,
+        earliest=_first_dated(dated, {file: end for file, (_, end) in set_ahead.items()}),
         latest=max((segment.latest for segment in dated), default=None),
         faults=tuple(faults),
         note=note,
     )
+
+
+def _set_ahead(timeline: Timeline, limit: Ns) -> dict[str, tuple[ClockFault, Ns]]:
+    """Returns by file the bags from before the clock was set far ahead during their recording.
+
+    Each comes with the first log time after that, if it has any, else that of its last message.
+    `limit` is the latest plausible date.
+    """
+    within = {
+        bag: span
+        for segment in timeline.recorded_segments
+        for bag, span in segment.set_ahead
+        if span[1] >= FIRST_BAGS_NS and bag.end <= limit
+    }
+    found = {
+        bag.file: (ClockFault(bag, FaultyClock.SET_AHEAD, end - start, until=start), end)
+        for bag, (start, end) in within.items()
+    }
+    lengths = {bag: end - start for bag, (start, end) in within.items()}
+    whole = splits_before_set_ahead(timeline, lengths, FAR_AHEAD_NS)
+    for bag, by in whole.items():
+        if FIRST_BAGS_NS <= bag.end + by <= limit:
+            found[bag.file] = ClockFault(bag, FaultyClock.SET_AHEAD, by), bag.end
+    return found
+
+
+def _first_dated(dated: Sequence[Segment], set_ahead: Mapping[str, Ns]) -> Ns | None:
+    """Returns the first log time of correctly dated bags; None without any.
+
+    `set_ahead` has by file the first log time after the clock was set.
+    """
+    if not set_ahead:
+        return dated[0].first[0] if dated else None
+    firsts: list[Ns] = []
+    for bag in chain.from_iterable(segment.bags for segment in dated):
+        firsts.append(set_ahead.get(bag.file, bag.start))
+        if bag.file not in set_ahead:
+            break
+    return min(firsts, default=None)
 
 
 def _step_faults(
@@ -242,7 +313,7 @@ def _is_shown_within_bag(fault: ClockFault, within_bags: Mapping[str, ClockFault
 
 def dated_segments(timeline: Timeline, faults: Sequence[ClockFault]) -> Sequence[Segment]:
     """Returns the recorded segments without the bags that mislead; remembers them."""
-    misdated = [fault.bag for fault in faults if fault.misleads]
+    misdated = [fault.bag for fault in faults if fault.leaves_out_bag]
     files = frozenset(bag.file for bag in misdated)
     remembered = timeline.memo.of(_DATED, dict)
     if files not in remembered:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_rows import BagRows
 
+FAR_AHEAD_NS: Final[Ns] = 30 * 24 * 3600 * NS_PER_S
+"""No recorder that runs pauses for so long: the clock was set ahead."""
 _SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
 """The shortest gap between two recordings with frequent topics."""
 _GAP_PERIODS: Final = 3

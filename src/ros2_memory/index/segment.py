@@ -22,7 +22,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import BagRows
-from ros2_memory.index.holes import Pause, pauses_between
+from ros2_memory.index.holes import FAR_AHEAD_NS, Pause, pauses_between
 from ros2_memory.index.split_order import StepBack
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
@@ -224,6 +224,16 @@ class Segment:
                 by, _ = set_back
                 steps.append(StepBack(bag, bag, by))
         return tuple(steps)
+
+    @cached_property
+    def set_ahead(self) -> tuple[tuple[BagFile, Span], ...]:
+        """The bags that pause for so long that the clock was set meanwhile; the last such pause."""
+        last = {
+            pause.bags[0].file: (pause.bags[0], pause.span)
+            for pause in self.pauses_within
+            if pause.ran_on and pause.length >= FAR_AHEAD_NS
+        }
+        return tuple(last.values())
 
     @cached_property
     def schemas(self) -> tuple[SummarySchema, ...]:

@@ -274,7 +274,10 @@ class Snapshot:
                 pauses += self._parts_shared_by_all(pause)
             if newest is None or segment.latest > newest.end:
                 newest = segment.newest
-        return sorted(pauses, key=lambda pause: pause.span)
+        # One that ends where a clock was set ahead begins before the memory.
+        begin = MIN_NS if self.earliest is None else self.earliest
+        dated = (pause for pause in pauses if pause.start >= begin)
+        return sorted(dated, key=lambda pause: pause.span)
 
     def _parts_shared_by_all(self, pause: Pause) -> Iterator[Pause]:
         """Yields the parts of a bag's pause in which no other bag has a message either."""

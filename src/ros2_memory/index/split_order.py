@@ -17,7 +17,7 @@ from ros2_memory.core.model import COMPRESSED
 from ros2_memory.core.timebase import MAX_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -138,6 +138,41 @@ def steps_of(timeline: Timeline) -> list[StepBack]:
         StepBack(bags[earlier], bags[later], int(ends[earlier]) - int(starts[later]))
         for earlier, later in zip(before[is_late].tolist(), after[is_late].tolist(), strict=True)
     ]
+
+
+def splits_before_set_ahead(
+    timeline: Timeline, set_ahead: Mapping[BagFile, Ns], far: Ns
+) -> dict[BagFile, Ns]:
+    """Returns the splits from before a recording's clock was set ahead, with how far that was (ns).
+
+    Args:
+        timeline: the bags.
+        set_ahead: the bags in which the clock was set, with how far (ns).
+        far: the clock was also set where the next split begins so much later (ns).
+    """
+    starts, ends = timeline.starts, np.maximum(timeline.ends, 0)
+    has_hole = np.any(starts[1:] - np.maximum.accumulate(ends)[:-1] >= far)
+    if not set_ahead and not has_hole:
+        return {}
+    series, numbers = _series_and_numbers(timeline)
+    bags, order = timeline.bags, np.lexsort((numbers, series))
+    before, after = order[:-1], order[1:]
+    is_next = (series[before] == series[after]) & (series[after] >= 0)
+    is_next &= (numbers[before] >= 0) & (numbers[before] + 1 == numbers[after])
+    run = np.concatenate(([0], np.cumsum(~is_next)))
+    places = np.flatnonzero(is_next & (starts[after] - ends[before] >= far)).tolist()
+    steps = [(place, int(starts[after[place]]) - int(ends[before[place]])) for place in places]
+    for bag, by in set_ahead.items():
+        rows = np.flatnonzero((starts == bag.start) & (ends == max(bag.end, 0))).tolist()
+        steps += [
+            (int(np.flatnonzero(order == row)[0]) - 1, by) for row in rows if bags[row] == bag
+        ]
+    found: dict[BagFile, Ns] = {}
+    for place, by in steps:
+        following = place + 1
+        first = int(np.searchsorted(run, run[following]))
+        found |= {bags[row]: by for row in order[first:following].tolist()}
+    return found
 
 
 def _series_and_numbers(timeline: Timeline) -> tuple[Ints, Ints]:

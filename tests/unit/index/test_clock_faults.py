@@ -222,3 +222,36 @@ def damage_time(path: Path, was: int, becomes: int) -> None:
     struct.pack_into("<I", content, chunk.chunk_start_offset + CRC_AT, 0)
     struct.pack_into("<Q", content, content.index(struct.pack("<QQ", was, was)), becomes)
     path.write_bytes(content)
+
+
+@pytest.mark.parametrize("is_split", [False, True])
+@pytest.mark.parametrize("wrong", [60 * S, BEGIN - 900 * DAY])
+def test_what_was_recorded_before_the_clock_was_set_ahead_by_years_begins_no_memory(
+    tmp_path: Path, wrong: int, is_split: bool
+) -> None:
+    """A computer without a battery dates its first messages by the day on which it was built."""
+    before = [wrong + n * S // 10 for n in range(100)]
+    after = [BEGIN + n * S // 10 for n in range(200)]
+    states = {at: text(at + 1000, "idle", topic="/mission") for at in (before[0], after[50])}
+    messages = [
+        message
+        for at in [*before, *after]
+        for message in (odom(at, at % HOUR / S, 0.0), *filter(None, [states.get(at)]))
+    ]
+    files = [messages[:51], messages[51:101], messages[101:]] if is_split else [messages]
+    for number, some in enumerate(files):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", some)
+    memory = memory_of(tmp_path)
+    reply = asked(memory, "data_time_range")
+    assert (reply["earliest"], reply["latest"]) == (after[0] / S, after[-1] / S)
+    assert (reply["gaps"], reply["clock_steps"]) == ([], [])
+    names = [fault["file"] for fault in reply["clock_faults"]]
+    assert names == [f"rec/rec_{number}.mcap" for number in range(2 if is_split else 1)]
+    assert all("the clock was set" in fault["reason"] for fault in reply["clock_faults"])
+    window = {"start": after[0] / S, "end": after[-1] / S}
+    held = asked(memory, "get_topic_in_range", topic="/mission", changes=True, **window)
+    assert [change["start"] for change in held["changes"]] == [(after[50] + 1000) / S]
+    by_day = asked(memory, "trajectory_summary", by="hour", max_waypoints=0, **window)
+    assert by_day["all"][0] == pytest.approx(20, abs=0.2)
+    found = asked(memory, "get_position_at", timestamp=before[10] / S)
+    assert found["timestamp"] == before[10] / S
