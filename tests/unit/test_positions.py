@@ -20,6 +20,8 @@ from tests.support.bags import (
     header,
     make,
     odom,
+    point,
+    quaternion,
     text,
     tf,
     transform,
@@ -138,6 +140,42 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     other = [vehicle(T0 + n * S, n, "/r2/odometry") for n in range(9)]
     write_mcap(tmp_path / "other.mcap", other)
     assert asked(memory, "find_matches", **above)["notes"].count(note) == 1
+
+
+def localised(n: int, topic: str) -> Msg:
+    """A localiser's pose of the robot."""
+    type_name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    pose = make("geometry_msgs/msg/Pose", position=point(n, 0), orientation=quaternion(0))
+    spread = make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    at = T0 + n * S
+    return Msg(topic, type_name, at, make(type_name, header=header(at, "map"), pose=spread))
+
+
+@pytest.mark.parametrize(
+    ("odometry", "others", "is_taken"),
+    [
+        (["/amr7/odom"], ["/amr7/amcl_pose"], True),
+        (["/base_controller/odom"], ["/amcl_pose"], True),
+        (["/r1/odom"], ["/r2/amcl_pose"], False),
+        (["/r1/odom", "/r2/odom"], ["/r1/amcl_pose"], False),
+        (["/amr7/wheels"], ["/amr7/amcl_pose"], False),
+    ],
+)
+def test_the_only_odometry_in_a_namespace_places_the_robot_also_beside_its_localiser(
+    tmp_path: Path, odometry: list[str], others: list[str], is_taken: bool
+) -> None:
+    messages = [odom(T0 + n * S, n / 2, 0.0, topic=topic) for n in range(9) for topic in odometry]
+    messages += [localised(n, topic) for n in range(9) for topic in others]
+    memory = remembered(tmp_path, messages)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 4)
+    assert ("error" not in reply) == is_taken
+    if is_taken:
+        assert (reply["topic"], reply["x"]) == (odometry[0], 2.0)
+        assert "the only odometry: data.pose_topic is /odom" in reply["notes"][0]
+        way = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 8)
+        assert way["distance_m"] == pytest.approx(4.0, abs=0.01)
+    else:
+        assert "set data.pose_topic to one of them" in reply["detail"]
 
 
 @each_way

@@ -78,6 +78,7 @@ def resolve_topic(view: View, name: str) -> str:
 def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False) -> str | None:
     """Returns the only topic with the robot's poses, if `data.pose_topic` is not recorded.
 
+    Of several topics it is the only `odom` in a namespace, if the others are of the same robot.
     With `degrees`, the only topic of a satellite receiver if no topic has poses. None if there is
     more than one topic, or if somebody set `data.pose_topic`.
     """
@@ -87,7 +88,17 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     topics = topics_of_robot(view, what)
     if not topics and degrees:
         topics = topics_of_robot(view, "geodetic")
+    if len(topics) > 1:
+        topics = _odometry_of_one_robot(topics)
     return topics[0] if len(topics) == 1 else None
+
+
+def _odometry_of_one_robot(topics: Sequence[str]) -> list[str]:
+    """Returns the `odom` topics if all topics are in their namespace, or in none."""
+    named = [topic for topic in topics if topic.endswith(_DEFAULT_POSES)]
+    spaces = tuple(topic.removesuffix(_DEFAULT_POSES) + "/" for topic in named)
+    are_of_one = all(topic.startswith(spaces) or topic.rfind("/") <= 0 for topic in topics)
+    return named if are_of_one else []
 
 
 def topics_of_robot(view: View, what: str) -> list[str]:
@@ -124,8 +135,8 @@ def resolve_pose_topic(
     only = only_pose_topic(view, what, degrees=degrees)
     if only is not None:
         view.notes.add(
-            f"by {only}, the only topic for it: data.pose_topic is {configured}, which these bags "
-            "do not have"
+            f"by {only}, {_why_only(view, what)}: data.pose_topic is {configured}, which these "
+            "bags do not have"
         )
         return only
     try:
@@ -136,6 +147,11 @@ def resolve_pose_topic(
             raise
         detail = f"data.pose_topic is {configured}, which these bags do not have{alternative}"
         raise NoDataError(error.reason, detail, error.notes) from error
+
+
+def _why_only(view: View, what: str) -> str:
+    others = len(topics_of_robot(view, what)) > 1
+    return "the only odometry" if others else "the only topic for it"
 
 
 def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None:
