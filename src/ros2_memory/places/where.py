@@ -18,6 +18,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import as_float
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
+from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
@@ -30,6 +31,7 @@ from ros2_memory.history.held_values import breaks_of, deletions, holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
+from ros2_memory.history.tested_messages import MET, UNKNOWN, MatchTester, Tested
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
     MapPlacement,
@@ -390,8 +392,8 @@ def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
 class _ConditionStates:
     """When the newest message of some topics met a condition.
 
-    Messages are read bag by bag, those around the time that is asked about. So it is quick to ask
-    about times from the newest to the oldest.
+    Messages are tested bag by bag, those around the time that is asked about, by their columns. So
+    it is quick to ask about times from the newest to the oldest.
     """
 
     def __init__(self, view: View, during: WhileCondition) -> None:
@@ -399,6 +401,7 @@ class _ConditionStates:
         topic, kind, value = during.topic, during.condition_type, during.value
         condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
         self.search = ReverseSearch(view, topic, condition)
+        self._tester = MatchTester(view, self.search)
         self._holds_on = holds_on(view, self.search.topics)
         break_times = breaks_of if self._holds_on else deletions
         # After these log times it is not known what the topics say, until their next message.
@@ -497,19 +500,34 @@ class _ConditionStates:
         start = min((span.first for span in spans), default=time)
         stop = max((span.last + 1 for span in spans), default=time + 1)
         stop = max(stop, time + 1)
-        messages = [*self._view.stream.messages(topics, TimeWindow(start, stop))]
-        if not messages or messages[0].time > start:
+        times, met = self._tested(TimeWindow(start, stop))
+        if not times or times[0] > start:
             before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
-            messages = messages if before is None else [before, *messages]
+            is_met = None if before is None else self.search.matches(before)
+            if before is not None and is_met is not None:
+                times, met = [before.time, *times], [is_met, *met]
             # None lies between the two: earlier times need no further search.
             start = MIN_NS if before is None else before.time + 1
-        self._times, self._met = [], []
-        for message in messages:
-            met = self.search.matches(message)
-            if met is not None:
-                self._times.append(message.time)
-                self._met.append(met)
+        self._times, self._met = times, met
         self._read = TimeWindow(start, stop)
+
+    def _blocks(self, topic: str, window: TimeWindow) -> Iterator[Tested]:
+        return (block.tested() for block in self._tester.newest_first(topic, window))
+
+    def _tested(self, window: TimeWindow) -> tuple[list[Ns], list[bool]]:
+        """Returns the log times of the messages in a window, in order, and whether each met it."""
+        # Of messages with one log time those of the last topic are the newest.
+        parts = [
+            replace(tested, sources=tested.sources + (nth << 32))
+            for nth, topic in enumerate(self.search.topics)
+            for tested in self._blocks(topic, window)
+        ]
+        if not parts:
+            return [], []
+        tested = stacked(parts)
+        order = np.lexsort((tested.sources, tested.times))
+        rows = order[tested.met[order] != UNKNOWN]
+        return tested.times[rows].tolist(), (tested.met[rows] == MET).tolist()
 
 
 def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
