@@ -45,8 +45,20 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
             return None
         targets = at_field(value, field)
         if not targets:
-            return f"the values have no field {field!r}; their fields are: {_paths(value, field)}"
+            fields = f"{_paths(value, field)}{_hint_on_json(value)}"
+            return f"the values have no field {field!r}; their fields are: {fields}"
     return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
+
+
+def _hint_on_json(value: JsonValue) -> str:
+    """Returns how to ask about a text that is JSON, of which no field can be named."""
+    text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
+    if not isinstance(text, str) or not text.lstrip().startswith(("{", "[")):
+        return ""
+    return (
+        ", a text of JSON: contains and contains_word look for words in it, and min_score leaves "
+        "out detections"
+    )
 
 
 def _refusal_for_position(value: JsonValue) -> str | None:

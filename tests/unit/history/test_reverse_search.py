@@ -165,6 +165,18 @@ def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -
         assert queries.find_last_match(*question, "above", 20, field="percentage").found is None
 
 
+def test_a_field_of_json_is_refused_with_what_to_ask_instead(tmp_path: Path) -> None:
+    found = '{"detections": [{"class": "thistle", "confidence": 0.9, "bbox": [1, 2, 3, 4]}]}'
+    memory = remembered(tmp_path, [text(T0, found, "/plants"), text(T0, "up", "/said")])
+    given = {"condition_type": "above", "field": "detections.confidence", "value": 0.8}
+    refused = asked(memory, "find_matches", topic="/plants", **given)["detail"]
+    assert refused.endswith(
+        "their fields are: value, a text of JSON: contains and contains_word look for words in it, "
+        "and min_score leaves out detections"
+    )
+    assert asked(memory, "find_matches", topic="/said", **given)["detail"].endswith("are: value")
+
+
 def test_percent_of_humidity_that_is_stated_as_a_fraction_is_refused(tmp_path: Path) -> None:
     def humidity(second: int, fraction: float) -> Msg:
         kind, ns = "sensor_msgs/msg/RelativeHumidity", T0 + second * NS_PER_S
