@@ -100,6 +100,11 @@ def last_word(key: str) -> str:
     return key.rpartition(" ")[2]
 
 
+def unspaced(key: str) -> str:
+    """Returns a key as one word: "forklift" for "fork lift"."""
+    return key.replace(" ", "")
+
+
 def moves_by_itself(key: str) -> bool:
     """Returns whether a key names people or pets."""
     return key not in _NO_ANIMALS and last_word(key) in _MOVES_BY_ITSELF

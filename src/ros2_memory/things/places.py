@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict, deque
-from itertools import combinations, pairwise, product
+from itertools import chain, combinations, pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -41,7 +41,7 @@ from ros2_memory.core.arrays import (
     stable_order,
 )
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.labels import Labels, last_word, moves_by_itself
+from ros2_memory.things.labels import Labels, last_word, moves_by_itself, unspaced
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -449,7 +449,8 @@ def with_synonyms(
     placed = np.unique(sights.spots[counts > 0, Spot.LABEL])
     for one, other in _pairs_of_a_kind({keys[label] for label in placed.tolist()}):
         masks = labels_of(one), labels_of(other)
-        if not are_two(one, other) and _alternate(sights, counts, *masks):
+        is_one = unspaced(one) == unspaced(other)
+        if not are_two(one, other) and (is_one or _alternate(sights, counts, *masks)):
             group = groups[one] | groups[other]
             groups |= dict.fromkeys(group, group)
     names: dict[str, str] = {}
@@ -461,13 +462,17 @@ def with_synonyms(
 
 
 def _pairs_of_a_kind(keys: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yields the pairs of keys that end in the same word, and name no people or pets."""
-    by_word: dict[str, list[str]] = defaultdict(list)
-    for key in sorted(keys):
+    """Yields the pairs of keys that may name the same thing, and no people or pets.
+
+    They end in the same word, or differ in spacing only ("fork lift", "forklift").
+    """
+    by_word: dict[str, set[str]] = defaultdict(set)
+    for key in keys:
         if not moves_by_itself(key):
-            by_word[last_word(key)].append(key)
-    for keys_of_a_kind in by_word.values():
-        yield from combinations(keys_of_a_kind, 2)
+            by_word[last_word(key)].add(key)
+            by_word[unspaced(key)].add(key)
+    of_a_kind = (combinations(sorted(keys_of_a_kind), 2) for keys_of_a_kind in by_word.values())
+    yield from sorted({*chain.from_iterable(of_a_kind)})
 
 
 def _are_beside(sights: JoinedSights, one: Flags, other: Flags) -> bool:

@@ -301,6 +301,20 @@ def test_labels_of_two_things_stay_two(
     assert ask(tmp_path, limits)["labels"] == dict.fromkeys(labels, 1)
 
 
+@pytest.mark.parametrize("label", ["forklift", "Fork_Lift", "forklifts"])
+def test_labels_that_differ_in_spacing_only_name_one_thing(tmp_path: Path, label: str) -> None:
+    """Two detectors write it otherwise, and each saw it at another time."""
+    seen = (
+        looked(0, 30, HERE, ("forklift", 3.0, 0.5)),
+        looked(30, 60, HERE, ("fork_lift", 3.0, 0.5)),
+    )
+    write_splits(tmp_path, [*seen[0], *seen[1]])
+    reply = ask(tmp_path, label=label)
+    assert [thing["count"] for thing in reply["things"]] == [60]
+    declared = QuerySettings(labels={"forklift": [], "fork lift": []})
+    assert ask(tmp_path, declared)["labels"] == {"fork lift": 1, "forklift": 1}
+
+
 def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> None:
     """By the owner's list these are two; where messages have both of them it needs no list."""
     moved = [
