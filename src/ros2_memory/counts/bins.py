@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_left
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date
 from itertools import compress, groupby
@@ -24,7 +25,7 @@ import numpy as np
 from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.core.arrays import bounds_of
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import listed
@@ -39,6 +40,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
+from ros2_memory.history.held_values import held_times, holds_on
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.places.pose_frames import known_track, map_placement, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
@@ -347,10 +349,20 @@ class BinnedWindow:
         self._columns.append(_Column(name, kind, values, whole))
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
-        """Adds how long topics had messages, without gaps and pauses of more than two splits."""
+        """Adds how long topics had messages, without gaps and pauses of more than two splits.
+
+        What a rare or latched topic said is known until its next message.
+        """
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
-        firsts, lasts = pieces_of(*self.bounds(topics), pause)
-        self.add_lengths(column, "duration", without(spans_of(firsts, lasts), self.gaps))
+        heard = spans_of(*pieces_of(*self.bounds(topics), pause))
+        # What was counted is answered also where no time is left for this.
+        with suppress(QueryTimeoutError):
+            for topic in topics:
+                if holds_on(self.view, [topic]):
+                    held = held_times(self.view, [topic], self.counted)
+                    known = (TimeWindow(*span).intersect(self.counted) for span in held)
+                    heard += [(part.start, part.stop) for part in known if not part.empty]
+        self.add_lengths(column, "duration", without(united(heard), self.gaps))
 
     def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
         """Returns the first and the last log times (ns) of each topic in each counted bag."""

@@ -12,7 +12,7 @@ known:
 from __future__ import annotations
 
 import json
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -25,6 +25,7 @@ from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
@@ -33,7 +34,7 @@ from ros2_memory.messages.conversions import Summary, names_others
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.stored_message import StoredMessage
@@ -468,3 +469,21 @@ def holds_on(view: View, topics: Iterable[str]) -> bool:
         or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))
         for topic in topics
     )
+
+
+def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:
+    """Returns when it is known what topics said whose messages hold on, without later windows.
+
+    That is from their first message on, but not from a break to their next message.
+    """
+    recordings = (view.timeline.recordings(topic).values() for topic in topics)
+    first = min((first for first, _ in chain.from_iterable(recordings)), default=MAX_NS)
+    breaks = sorted(chain.from_iterable(breaks_of(view, topic) for topic in topics))
+    unknown: Spans = []
+    reached = MIN_NS
+    for at in breaks[max(bisect_right(breaks, window.start) - 1, 0) :]:
+        if reached <= at < window.stop:
+            message = view.stream.first([*topics], TimeWindow(at + 1, window.stop))
+            reached = MAX_NS if message is None else message.time
+            unknown.append((at, reached))
+    return without([(first, MAX_NS)], unknown)

@@ -27,7 +27,7 @@ from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import breaks_of, deletions, holds_on
+from ros2_memory.history.held_values import breaks_of, deletions, held_times, holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -419,24 +419,10 @@ class _ConditionStates:
 
         What latched and rare topics said holds through silences; what others said does not.
         """
-        topics, timeline = self.search.topics, self._view.timeline
+        topics = self.search.topics
         if self._holds_on:
-            spans = (span for topic in topics for span in timeline.recordings(topic).values())
-            known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
-            return without(known, self._after_breaks(window))
+            return held_times(self._view, topics, window)
         return heard_times(self._view, topics, window.widened(SILENCE_NS))
-
-    def _after_breaks(self, window: TimeWindow) -> Spans:
-        """Returns the times from each break to the next message that overlap a window."""
-        spans: Spans = []
-        reached = MIN_NS
-        for at in self._breaks[max(bisect_right(self._breaks, window.start) - 1, 0) :]:
-            if reached <= at < window.stop:
-                after = TimeWindow(at + 1, window.stop)
-                message = self._view.stream.first(self.search.topics, after)
-                reached = MAX_NS if message is None else message.time
-                spans.append((at, reached))
-        return spans
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message at a log time met the condition.

@@ -187,3 +187,18 @@ def test_no_value_holds_from_one_clock_to_the_next(tmp_path: Path) -> None:
     assert (rows["idle"]["first_unix"], rows["busy"]["last_unix"]) == (TRUE, TRUE + 5)
     of_1970 = table(of_topic(start=UNSET - 5, end=UNSET + 60))
     assert of_1970["all"]["last_unix"] == UNSET + 1
+
+
+@each_way
+def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """In two runs a mission says what it does when that changes, first after 10 s."""
+    for begin in (0, 2000):
+        said = ((10, "CHARGING"), (400, "SCOUTING"), (700, "CHARGING"))
+        states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said]
+        messages = [odom(T0 + (begin + at) * S, 0.0) for at in range(0, 1001, 2)]
+        write_splits(tmp_path, [*states, *messages], 10, f"run{begin}")
+    given = {"topic": "/mission", "condition_type": "equals", "value": "CHARGING", "by": "day"}
+    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
+    assert table(reply)["all"]["topic_s"] == pytest.approx(2 * 990, abs=1)
