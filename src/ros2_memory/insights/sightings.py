@@ -25,7 +25,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
-from ros2_memory.history.held_values import held_at, held_until, is_latched
+from ros2_memory.history.held_values import held_at, held_until, holds_on, is_latched, is_text
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots_on
@@ -192,6 +192,8 @@ def _select_rows(
     search = ReverseSearch(view, pattern, condition)
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_latched_notes(view, search, scope.window))
+    if selected.sightings:
+        view.notes.add(*_notes_on_texts(view, topics))
     return selected
 
 
@@ -335,7 +337,10 @@ def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope)
             found.since,
             f"more than {MOST_COUNTED:,} episodes" if is_full else "",
         )
-    return _run_spans(view, ReverseSearch(view, pattern, condition), scope)
+    spans = _run_spans(view, ReverseSearch(view, pattern, condition), scope)
+    if spans.spans.size:
+        view.notes.add(*_notes_on_texts(view, topics))
+    return spans
 
 
 def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans:
@@ -398,6 +403,16 @@ def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> Stor
         return None
     for_type = condition.of_type(held.type, view.extractor)
     return held if for_type.matches(view.value(held)) else None
+
+
+def _notes_on_texts(view: View, topics: Sequence[str]) -> Iterator[str]:
+    """Yields a note if rare texts, as of a mission's states, count as long as their messages."""
+    for topic in topics:
+        if is_text(view, topic) and not is_latched(view, topic) and holds_on(view, [topic]):
+            yield (
+                f"a text on {topic} counts for the moment in which it was said: changes, and by "
+                "value, of get_topic_in_range have for how long each held until the next one"
+            )
 
 
 def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:

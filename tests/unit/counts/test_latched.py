@@ -202,3 +202,8 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
     given = {"topic": "/mission", "condition_type": "equals", "value": "CHARGING", "by": "day"}
     reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
     assert table(reply)["all"]["topic_s"] == pytest.approx(2 * 990, abs=1)
+    note = "a text on /mission counts for the moment in which it was said"
+    assert any(sentence.startswith(note) for sentence in reply["notes"])
+    del given["by"]
+    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
+    assert any(sentence.startswith(note) for sentence in reply["notes"])
