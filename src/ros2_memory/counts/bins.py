@@ -40,7 +40,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import held_times, holds_on
+from ros2_memory.history.held_values import held_times, states_hold_on
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.places.pose_frames import known_track, map_placement, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
@@ -351,14 +351,15 @@ class BinnedWindow:
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without gaps and pauses of more than two splits.
 
-        What a rare or latched topic said is known until its next message.
+        What a latched topic, or a rare one of texts or booleans, said is known until its next
+        message.
         """
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
         heard = spans_of(*pieces_of(*self.bounds(topics), pause))
         # What was counted is answered also where no time is left for this.
         with suppress(QueryTimeoutError):
             for topic in topics:
-                if holds_on(self.view, [topic]):
+                if states_hold_on(self.view, topic):
                     held = held_times(self.view, [topic], self.counted)
                     known = (TimeWindow(*span).intersect(self.counted) for span in held)
                     heard += [(part.start, part.stop) for part in known if not part.empty]

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
+_BOOLEAN: Final = "std_msgs/msg/Bool"
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
 _MOST_TRIED: Final = 200
@@ -469,6 +470,15 @@ def holds_on(view: View, topics: Iterable[str]) -> bool:
         or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))
         for topic in topics
     )
+
+
+def states_hold_on(view: View, topic: str) -> bool:
+    """Returns whether a topic states something that lasts through silence.
+
+    It is latched, or rare and of texts or booleans. A number of a rare topic is measured anew.
+    """
+    are_states = {TEXT, _BOOLEAN}.issuperset(view.timeline.types_of(topic))
+    return is_latched(view, topic) or (are_states and holds_on(view, [topic]))
 
 
 def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.bags import McapLayout, boolean, odom, text, write_mcap, write_splits
+from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap, write_splits
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
@@ -207,3 +207,20 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
     del given["by"]
     reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
     assert any(sentence.startswith(note) for sentence in reply["notes"])
+
+
+@each_way
+def test_a_rare_measurement_that_falls_silent_is_not_known_any_more(
+    tmp_path: Path, recalls: bool
+) -> None:
+    levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
+    write_mcap(
+        tmp_path / "rec" / "rec_0.mcap",
+        sorted(
+            [*levels, *(odom(T0 + at * S, 0.0) for at in range(1001))],
+            key=lambda message: message.log_time,
+        ),
+    )
+    given = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
+    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", value=0, by="day", **given)
+    assert table(reply)["all"]["topic_s"] == pytest.approx(400, abs=1)
