@@ -472,6 +472,15 @@ def holds_on(view: View, topics: Iterable[str]) -> bool:
     )
 
 
+def ends_of_holding(view: View, topic: str) -> list[Ns]:
+    """Returns the moments after which what a rare or latched topic said is not known to hold.
+
+    These are `breaks_of`, and where a topic with a usual rate fell silent.
+    """
+    silences = (silence for silence in view.snapshot.silences if silence.topic == topic)
+    return sorted({*breaks_of(view, topic), *(silence.start for silence in silences)})
+
+
 def states_hold_on(view: View, topic: str) -> bool:
     """Returns whether a topic states something that lasts through silence.
 
@@ -488,7 +497,7 @@ def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans
     """
     recordings = (view.timeline.recordings(topic).values() for topic in topics)
     first = min((first for first, _ in chain.from_iterable(recordings)), default=MAX_NS)
-    breaks = sorted(chain.from_iterable(breaks_of(view, topic) for topic in topics))
+    breaks = sorted(chain.from_iterable(ends_of_holding(view, topic) for topic in topics))
     unknown: Spans = []
     reached = MIN_NS
     for at in breaks[max(bisect_right(breaks, window.start) - 1, 0) :]:

@@ -27,7 +27,7 @@ from ros2_memory.core.text import abbreviate, caseless
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import breaks_of, deletions, held_times, holds_on
+from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -403,7 +403,7 @@ class _ConditionStates:
         self.search = ReverseSearch(view, topic, condition)
         self._tester = MatchTester(view, self.search)
         self._holds_on = holds_on(view, self.search.topics)
-        break_times = breaks_of if self._holds_on else deletions
+        break_times = ends_of_holding if self._holds_on else deletions
         # After these log times it is not known what the topics say, until their next message.
         self._breaks = sorted(
             chain.from_iterable(break_times(view, topic) for topic in self.search.topics)

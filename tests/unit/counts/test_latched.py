@@ -224,3 +224,19 @@ def test_a_rare_measurement_that_falls_silent_is_not_known_any_more(
     given = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
     reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", value=0, by="day", **given)
     assert table(reply)["all"]["topic_s"] == pytest.approx(400, abs=1)
+
+
+@each_way
+def test_a_while_on_a_rare_measurement_ends_where_that_falls_silent(
+    tmp_path: Path, recalls: bool
+) -> None:
+    levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
+    moving = [odom(T0 + at * S, 0.0) for at in range(1001)]
+    other = [boolean(T0 + at * S, True) for at in range(1001)]
+    write_splits(tmp_path, [*levels, *moving, *other], 100)
+    charged = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
+    counted = matches(
+        tmp_path, BUMPER, 0, 1000, recalls=recalls, by="day", **{"while": {**charged, "value": 0.2}}
+    )
+    whole = table(counted)["all"]
+    assert (whole["seconds"], whole["unknown_s"]) == (400, 600)
