@@ -26,8 +26,8 @@ mean square successive difference", Ann. Math. Statist. 12 (1941).
 
 Sudden losses of speed are found in the first poses of slots of `DROP_SLOT_NS`. The robot goes
 `MOVING_MPS` or faster from slot to slot. Then its speed falls, within two slots, to `FRACTION` of
-that or less, and stays there for two slots. If it turns meanwhile it slows down on purpose, as
-nearly all robots do. A drop depends on `_DROP_SLOTS` slots in a row: poses that come less often
+that or less, and stays there for two slots. If it turns meanwhile, or in the two slots after these,
+it slows down on purpose, as nearly all robots do. A drop depends on `_DROP_SLOTS` slots in a row: poses that come less often
 than once a slot, and a position that jumps for a moment, show none.
 """
 
@@ -114,7 +114,7 @@ DROP_SLOT_NS: Final = NS_PER_S // 2
 MOVING_MPS: Final = 0.15
 FRACTION: Final = 0.4
 TURNS_RAD: Final = 0.35
-_DROP_SLOTS: Final = 7
+_DROP_SLOTS: Final = 9
 """How many slots decide whether there is a drop at the fourth of them, and none at the third."""
 
 
@@ -586,8 +586,8 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])
     slots = times // DROP_SLOT_NS
     in_a_row = slots[_DROP_SLOTS - 1 :] - slots[: 1 - _DROP_SLOTS] < _DROP_SLOTS
-    drops = np.flatnonzero(in_a_row & falls[1:] & ~falls[:-1])
-    turned = headings(poses.turns[rows[drops + 6]]) - headings(poses.turns[rows[drops + 2]])
+    drops = np.flatnonzero(in_a_row & falls[1:-2] & ~falls[:-3])
+    turned = headings(poses.turns[rows[drops + 8]]) - headings(poses.turns[rows[drops + 2]])
     # A comparison with NaN is false: without a heading the robot is taken not to turn.
     drops = drops[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
     return tuple(

@@ -185,6 +185,7 @@ def turned(poses: list[Pose]) -> PoseArrays:
         [],
         driven((5, 0.5, 0), (5, 0.4, 0), (5, 0.3, 0), (5, 0.25, 0)),  # slower, not much at a time
         driven((5, 0.5, 0), (2, 0.0, 0.8), (5, 0.5, 0)),  # to turn
+        driven((5, 0.8, 0), (0.4, 0.6, 0), (0.4, 0.4, 0), (0.4, 0.2, 0), (0.5, 0, 0), (4, 0, 0.5)),
         driven((5, 0.1, 0), (2, 0.0, 0), (5, 0.1, 0)),  # hardly moved
         driven((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
         driven((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
