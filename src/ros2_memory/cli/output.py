@@ -103,8 +103,9 @@ def spinner(activity: str) -> Iterator[Callable[[str], None]]:
     if not console.is_terminal:
         yield lambda _: None
         return
-    with console.status(escape(activity)) as status:
-        yield lambda text: status.update(escape(text))
+    # A `Text`: in a string, brackets of a question or a path would be Rich's markup.
+    with console.status(Text(escape(activity))) as status:
+        yield lambda text: status.update(Text(escape(text)))
 
 
 def print_reply(reply: JsonValue) -> None:

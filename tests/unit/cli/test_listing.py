@@ -10,16 +10,19 @@ import subprocess
 import sys
 from contextlib import closing
 from datetime import datetime
-from io import BytesIO, TextIOWrapper
+from functools import partial
+from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
+from ros2_memory.cli import output
 from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
@@ -261,6 +264,20 @@ def test_no_text_commands_a_terminal_nor_a_reply_and_letters_that_it_has_not_are
     monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
     assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
     assert written.getvalue().endswith(b" k\\xfcche\n")
+
+
+def test_brackets_of_a_path_and_of_a_question_are_shown_as_they_stand(
+    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag_dir = tmp_path / "[robot a]" / "[bold]"
+    write_mcap(bag_dir / "rec_0.mcap", [text(T0, "hello")])
+    terminal = StringIO()
+    console = partial(Console, file=terminal, force_terminal=True, width=1000)
+    monkeypatch.setattr(output, "Console", console)
+    exits(0, "topics", bag_dir)
+    assert f"looking through {bag_dir}" in terminal.getvalue()
+    exits(1, "ask", bag_dir, "[/x]")
+    assert "asking [/x]" in terminal.getvalue()
 
 
 def test_csv_has_a_column_for_each_field(folder: Path, exits: Program) -> None:
