@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.bag_dir.handover_file import sure_handover
-from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
+from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE, OWN_FOLDER
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.store import LONG_NS, BagKey, relative
 from ros2_memory.columns.writing import PART_NS, Level, ReadBag
@@ -55,7 +55,7 @@ class StoreLimits:
 
     Attributes:
         max_share: its share of the bytes of the bags.
-        max_bytes: its bytes, if the file is not in the bag directory. The oldest bags go first.
+        max_bytes: its bytes, if the file is not beside the bags. The oldest bags go first.
         least_bytes_per_s: how many bytes a second of bags may take, however small they are.
     """
 
@@ -439,7 +439,9 @@ class Filling:
         path = self.store.path
         if path is None:
             return min(IN_MEMORY_BYTES, self._limits.max_bytes)
-        return None if path.is_relative_to(self._bag_dir) else self._limits.max_bytes
+        # Bags in a home folder have the cache folder below them.
+        is_beside = path.parent == self._bag_dir / OWN_FOLDER
+        return None if is_beside else self._limits.max_bytes
 
     def _refuse(self, bag: BagFile, reason: str) -> None:
         log.warning("bag_not_stored", path=str(bag.path), reason=reason)

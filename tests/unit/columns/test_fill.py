@@ -84,8 +84,12 @@ def test_bags_have_parts_together_also_beside_one_of_a_clock_that_was_ahead(
     assert count(tmp_path, "part") == tables * (2 + len(others))
 
 
-def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path: Path) -> None:
-    bag_dir = tmp_path / "bags"
+@pytest.mark.parametrize("inside", ["bags", "."])
+def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(
+    tmp_path: Path, inside: str
+) -> None:
+    """Also in one below the bags, as where these lie in a home folder."""
+    bag_dir = tmp_path / inside
     for number in range(40):
         write_bag(bag_dir, number, rows=150)
     cache = tmp_path / "cache" / "columns.sqlite"
