@@ -111,7 +111,7 @@ class Where:
 
 
 def parse_where(
-    limits: QuerySettings,
+    settings: QuerySettings,
     value: JsonValue,
     default_radius_m: float | None = None,
     what: str = "where",
@@ -119,7 +119,7 @@ def parse_where(
     """Returns the region that a value of the argument `where` describes.
 
     Args:
-        limits: the settings, which have the named places.
+        settings: those of queries, which have the named places.
         value: the argument: one place, or several.
         default_radius_m: the radius of a circle that gives none; None if it must give one.
         what: the name of the argument, for errors.
@@ -127,18 +127,19 @@ def parse_where(
     Raises:
         InvalidArgumentsError: the value is no region, or no place has that name.
     """
-    several = _places_by_name(limits, value)
+    several = _places_by_name(settings, value)
     if several is None:
-        return _parse_place(limits, value, default_radius_m, what)
+        return _parse_place(settings, value, default_radius_m, what)
     if len(several) > _MOST_PLACES:
         raise InvalidArgumentsError(
             f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
+    with_coordinates = {_spelling(name) for name in several if isinstance(several[name], dict)}
     places: list[Where] = []
     for name, place_value in several.items():
-        place = _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}")
+        place = _parse_place(settings, place_value, default_radius_m, f"{what}: {abbreviate(name)}")
         # Coordinates may have been given the name of a place that the settings have.
-        if place.name is None or isinstance(several.get(place.name), dict):
+        if place.name is None or _spelling(place.name) in with_coordinates:
             place = replace(place, name=name)
         # Two spellings of one name are one place.
         if place not in places:
@@ -147,7 +148,7 @@ def parse_where(
         return places[0]
     region = AnyOf(tuple(part.region for part in places))
     names = ", ".join(part.title for part in places)
-    return Where(region, _shared_frame(places), names, tuple(places))
+    return Where(region, _shared_frame(places, what), names, tuple(places))
 
 
 def has_coordinates(value: object) -> bool:
@@ -155,11 +156,11 @@ def has_coordinates(value: object) -> bool:
     return isinstance(value, dict) and not all(isinstance(part, str) for part in value.values())
 
 
-def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | None:
+def _places_by_name(settings: QuerySettings, value: JsonValue) -> JsonObject | None:
     """Returns the values of several places by name; None if the value describes one place."""
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
-        if len(names) == 1 or _place_named(limits, value) is not None:
+        if len(names) == 1 or _place_named(settings, value) is not None:
             return None
         return {name: name for name in names if name} or None
     if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
@@ -172,7 +173,7 @@ def _places_by_name(limits: QuerySettings, value: JsonValue) -> JsonObject | Non
     return value if are_places and not is_one else None
 
 
-def _shared_frame(several: Sequence[Where]) -> str | None:
+def _shared_frame(several: Sequence[Where], what: str) -> str | None:
     """Returns the one frame that places name; coordinates without a frame are in it, too.
 
     Raises:
@@ -181,18 +182,18 @@ def _shared_frame(several: Sequence[Where]) -> str | None:
     name_by_frame = {part.frame_id: part.title for part in several if part.frame_id is not None}
     if len(name_by_frame) > 1:
         listed = ", ".join(f"{name} is in {frame}" for frame, name in name_by_frame.items())
-        raise InvalidArgumentsError(f"where: {listed}: ask about places of one frame")
+        raise InvalidArgumentsError(f"{what}: {listed}: ask about places of one frame")
     return next(iter(name_by_frame), None)
 
 
 def _parse_place(
-    limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
+    settings: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        if (place := _place_named(limits, value)) is not None:
+        if (place := _place_named(settings, value)) is not None:
             return Where(place.region, place.frame_id, place.name)
-        names = ", ".join(sorted(named.name for named in limits.places))
-        none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
+        names = ", ".join(sorted(named.name for named in settings.places))
+        none = f"none are named in {places_setting(settings)}; {_EXPECTED}"
         listed = f"there are: {names}" if names else none
         raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(value)}; {listed}")
     region = _region_of(value, default_radius_m)
@@ -217,27 +218,30 @@ def _region_of(value: JsonValue, default_radius_m: float | None) -> Region | Non
 
 
 def places_asked(
-    limits: QuerySettings, where: Where | None, frames: Iterable[str]
+    settings: QuerySettings, where: Where | None, frames: Iterable[str]
 ) -> tuple[Place, ...]:
     """Returns the named places of the settings, and the places that a question names.
 
     A place of the question without a frame is taken once in each of `frames`.
     """
     asked = [] if where is None or where.name is None else [where.places(frame) for frame in frames]
-    return tuple(dict.fromkeys(chain(limits.places, *asked)))
+    return tuple(dict.fromkeys(chain(settings.places, *asked)))
 
 
-def places_setting(limits: QuerySettings) -> str:
+def places_setting(settings: QuerySettings) -> str:
     """Returns the name of the setting for places, and the path of the file that was read."""
-    return f"{PLACES_SETTING}, here {limits.places_file}" if limits.places_file else PLACES_SETTING
+    file = settings.places_file
+    return f"{PLACES_SETTING}, here {file}" if file else PLACES_SETTING
 
 
-def _place_named(limits: QuerySettings, name: str) -> Place | None:
-    wanted = caseless(" ".join(name.split()))
-    for place in limits.places:
-        if caseless(" ".join(place.name.split())) == wanted:
-            return place
-    return None
+def _place_named(settings: QuerySettings, name: str) -> Place | None:
+    spelling = _spelling(name)
+    return next((place for place in settings.places if _spelling(place.name) == spelling), None)
+
+
+def _spelling(name: str) -> str:
+    """Returns a name as names are compared: without case, and with single spaces."""
+    return caseless(" ".join(name.split()))
 
 
 def note_other_frame(

@@ -5,6 +5,7 @@ What is expected is counted from the drawn world itself, second by second.
 
 import math
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from operator import attrgetter
@@ -17,6 +18,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
@@ -135,6 +137,30 @@ def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
     reply = asked(memory, "visits", **given)
     assert (said is None) == ("error" not in reply)
     assert said is None or said in reply["detail"]
+
+
+@pytest.mark.parametrize("name", ["hall", "Hall", " HALL"])
+def test_coordinates_with_the_name_of_a_place_leave_that_place_the_name_it_is_given(
+    memory: Memory, name: str
+) -> None:
+    where = {name: bounds("den")["den"], "b": "hall"}
+    visited = table(asked(memory, "visits", by="place", where=where))
+    assert [*visited] == [name, "b", "(elsewhere)", "(unknown)", "all"]
+    alone = table(asked(memory, "visits", by="place", where=["den", "hall"]))
+    assert [visited[name], visited["b"]] == [alone["den"], alone["hall"]]
+
+
+@pytest.mark.parametrize(
+    ("tool", "argument"), [("visits", "where"), ("trajectory_summary", "farthest_from")]
+)
+def test_places_of_several_frames_are_refused_by_the_name_of_the_argument(
+    memory: Memory, tool: str, argument: str
+) -> None:
+    dock = Place("dock", "base_dock", Circle(0.0, 0.0, 1.0))
+    memory = replace(memory, limits=replace(memory.limits, places=(*memory.limits.places, dock)))
+    span = {"start": BEGIN, "end": BEGIN + 60} if tool == "trajectory_summary" else {}
+    reply = asked(memory, tool, **{argument: "hall, dock"}, **span)
+    assert reply["detail"].startswith(f"{argument}: hall is in odom, dock is in base_dock")
 
 
 @each_way
