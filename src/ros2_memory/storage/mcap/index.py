@@ -60,7 +60,6 @@ if TYPE_CHECKING:
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _INDEX_LENGTH: Final = struct.Struct("<Q")
-_new_tuple: Final = tuple.__new__
 _MAX_CACHED_BYTES: Final = 128 << 10
 """Longer declarations are decoded anew for each file, so that the cache stays below 4 MiB."""
 
@@ -158,9 +157,7 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
         places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize]
     )
     (index_length,) = _INDEX_LENGTH.unpack_from(section, stop)
-    # Not by `Chunk(...)`: that function alone costs as much as all the rest.
-    fields = (offset, length, start, last, channels, places, index_length, None, False)
-    return _new_tuple(Chunk, fields)
+    return Chunk(offset, length, start, last, channels, places, index_length)
 
 
 @lru_cache(1024)
