@@ -5,7 +5,8 @@ A message that stays is as it was recorded. A message goes if another one says t
 - Poses: one a second stays while the frame or robot moves (`STEP_NS`), one in two seconds while it
   stands. So standstills are found, and poses that are farther apart mean that none was recorded.
 - Booleans, statuses and names: every message that changes the value stays, and the one before it.
-  An integer is a status in five minutes in which it has few values, or does not change often.
+  An integer or a JSON text is a status in five minutes in which it has few values, or does not
+  change often.
 - Detections of a second, and transforms of a slot: as few messages stay as show all labels and
   frames, each label with its highest score (`_STEPS`), and the most of a label at once.
 - Other numbers: one message a slot stays, and the least and the greatest value of five minutes.
@@ -121,7 +122,8 @@ _MOVED: Final = 0.05
 """In metres; also of each component of a unit quaternion, which is then a turn by 6 degrees."""
 _FEW: Final = 8
 _OFTEN: Final = 7
-"""Integers of more than `_FEW` values that change more often in a slot are measurements."""
+"""Integers of more than `_FEW` values that change more often in a slot are measurements, and JSON
+texts have a stamp or measurements in them."""
 _STEPS: Final = 20
 """Steps of a unit of scores: a score of 0.52 may stand for one of 0.54."""
 _HIGHEST: Final = 1e6
@@ -222,12 +224,12 @@ class _Extremes(NamedTuple):
 
 
 class _Changes(NamedTuple):
-    """The changes of an integer in a slot: the log times before and after each.
+    """The changes of an integer or a JSON text in a slot: the log times before and after each.
 
-    `values` are the integer's values, at most one more than `_FEW`.
+    `values` are its values, at most one more than `_FEW`.
     """
 
-    values: Numbers
+    values: set[object]
     before: IntArray
     after: IntArray
 
@@ -256,26 +258,25 @@ class TopicThinning:
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
-        times, labels = table.log_times, self._labels(table)
-        has_labels = any(labels)
+        times = table.log_times
         for path, column in table.columns.items():
             if isinstance(column, Texts):
-                # A text with detections differs in each message: it is no status.
-                if not has_labels:
-                    self._staying += self._changed(path, column.codes, column.values(), times)
+                self._add_texts(path, column, times)
             elif _is_measured(column):
                 self._add_extremes(path, column, times)
             elif not _is_time(table, path):
-                self._add_integers(path, column, times)
+                self._add_changes(path, column, column.tolist(), times)
                 self._add_extremes(path, column, times)
         self._add_poses("", times, _poses(table.columns))
+        labels = self._labels(table)
+        shown = [{**names} for names in labels]  # labels, and below the frames
         for path, inner in table.elements.items():
-            self._add_frames(inner, times, labels)
+            self._add_frames(inner, times, shown)
             self._add_states(path, inner, times)
         slot_ns = self.numbers_ns if has_numbers(table) else THINNED_NS
         if slot_ns == THINNED_NS:
             self._add_pauses(times)
-        self._add_slots(times, labels, STEP_NS if has_labels else slot_ns)
+        self._add_slots(times, shown, STEP_NS if any(labels) else slot_ns)
 
     def _add_slots(
         self, times: IntArray, names: Sequence[Mapping[Name, Scored]], slot_ns: Ns
@@ -329,15 +330,14 @@ class TopicThinning:
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
         extremes = [time for slot in self._extremes.values() for _, time in slot]
-        staying, most = (
-            [*self._staying, np.array(extremes, np.int64)],
-            EXTREMES_NS // self.numbers_ns,
-        )
+        staying = [*self._staying, np.array(extremes, np.int64)]
+        most = EXTREMES_NS // self.numbers_ns * _OFTEN
         for changes in self._changes.values():
-            values, before, after = map(np.concatenate, zip(*changes, strict=True))
-            is_status = np.unique(values).size <= _FEW or after.size <= most * _OFTEN
-            if is_status:
-                staying += [before, after]
+            values = set[object]().union(*[change.values for change in changes])
+            count = sum(change.after.size for change in changes)
+            if len(values) <= _FEW or count <= most:
+                staying += [change.before for change in changes]
+                staying += [change.after for change in changes]
         return np.unique(np.concatenate(staying))
 
     def _changed(
@@ -355,13 +355,25 @@ class TopicThinning:
             return np.append(before, last_time), np.append(after, times[0])
         return before, after
 
-    def _add_integers(self, path: str, column: Numbers, times: IntArray) -> None:
-        before, after = self._changed(path, column, column.tolist(), times)
+    def _add_texts(self, path: str, column: Texts, times: IntArray) -> None:
+        values = column.values()
+        if looks_like_json(column.words[0]):  # with a stamp it differs in each message
+            self._add_changes(path, column.codes, values, times)
+        else:
+            self._staying += self._changed(path, column.codes, values, times)
+
+    def _add_changes(
+        self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
+    ) -> None:
+        """Adds the changes of a value, which stay where it is a status."""
+        before, after = self._changed(path, codes, values, times)
         slots, slots_after = times // EXTREMES_NS, after // EXTREMES_NS
         for slot in np.unique(slots).tolist():
             inside = slots_after == slot
-            values = np.unique(column[slots == slot])[: _FEW + 1]
-            self._changes[path, slot].append(_Changes(values, before[inside], after[inside]))
+            rows = np.flatnonzero(slots == slot)
+            _, firsts = np.unique(codes[rows], return_index=True)
+            few = {values[row] for row in rows[firsts[: _FEW + 1]].tolist()}
+            self._changes[path, slot].append(_Changes(few, before[inside], after[inside]))
 
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         slots, is_finite = times // EXTREMES_NS, np.isfinite(numbers)

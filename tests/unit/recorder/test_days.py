@@ -722,6 +722,39 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
     assert len(found) < 20
 
 
+@pytest.mark.parametrize("first", [(), ({"label": "mug", "score": 0.9},)])
+@pytest.mark.parametrize("cut", [1, 300])
+def test_of_a_json_detector_that_sees_nothing_at_most_one_message_a_second_stays(
+    bag_dir: Path, first: Sequence[object], cut: int
+) -> None:
+    """600 messages at 10 Hz, each with its own stamp; the first may have seen something."""
+    messages: list[Msg] = []
+    for nth in range(600):
+        said = {"stamp": T0_S + nth / 10, "detections": [] if nth else [*first]}
+        messages.append(text(T0 + nth * S // 10, json.dumps(said), "/objects"))
+    for nth, part in enumerate((messages[:cut], messages[cut:])):
+        write_mcap(bag_dir / "rec_A" / f"rec_A_{nth}.mcap", part)
+    keep_all(bag_dir, limits=MemoryLimits(texts=("/objects",)))
+    assert 9 <= topics_in(bag_dir)["/objects"] <= 60 + 2
+
+
+def test_json_that_changes_slowly_and_other_texts_keep_each_change(bag_dir: Path) -> None:
+    """At 10 Hz: a state for 2 s each, and the lines of a log."""
+    messages: list[Msg] = []
+    for nth in range(600):
+        at = T0 + nth * S // 10
+        messages.append(text(at, json.dumps({"task": nth // 20}), "/task"))
+        messages.append(text(at, f"line {nth}", "/log"))
+    record(bag_dir, messages)
+    keep_all(bag_dir, limits=MemoryLimits(texts=("/*",)))
+    stayed: dict[str, set[int]] = {"/task": set(), "/log": set()}
+    for message in messages_in(bag_dir / DAY_FILE):
+        stayed[message.channel.topic].add((message.log_time - T0) * 10 // S)
+    assert stayed["/task"] >= {nth for nth in range(19, 599) if nth % 20 in {0, 19}}
+    assert len(stayed["/task"]) < 80
+    assert stayed["/log"] == {*range(600)}
+
+
 def test_a_field_that_is_called_length_makes_no_array(bag_dir: Path) -> None:
     size, parcel = "my_msgs/msg/Size", "my_msgs/msg/Parcel"
     typestore().register(get_types_from_msg("float64 length\n", size))
