@@ -178,8 +178,7 @@ class Cells:
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns the distance (mm) and the direction (degrees from ahead) of each look's place."""
         dx, dy = x - self.x[looks], y - self.y[looks]
-        bearing = (np.degrees(np.arctan2(dy, dx)) - self.heading(looks) + 180.0) % 360.0 - 180.0
-        return np.hypot(dx, dy), bearing
+        return np.hypot(dx, dy), half_turns(np.degrees(np.arctan2(dy, dx)) - self.heading(looks))
 
     def heading(self, looks: Ints) -> Floats:
         """Returns where the detector of each look was turned to (degrees)."""
@@ -213,7 +212,7 @@ def _joined_cells(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: In
         place, is_there = places_among(neighbour, ordered)
         one = np.flatnonzero(is_there & (cells[:, 0] >= 0))
         other = order[place[one]]
-        turn = np.abs((yaw[other] - yaw[one] + 180.0) % 360.0 - 180.0)
+        turn = np.abs(half_turns(yaw[other] - yaw[one]))
         away = np.hypot(x[other] - x[one], y[other] - y[one])
         near = (turn < CELL_DECIDEG / 10) & (away < CELL_MM)
         one, other = one[near], other[near]
@@ -375,9 +374,15 @@ def _are_in_view(cells: Cells, fields: Floats, places: Floats, looks: Ints) -> F
     """Returns which looks have their place in the field of view of their topic."""
     numbers = _number(looks)
     distance, bearing = cells.seen_at(numbers, *places[_place(looks)].T)
-    far, left, right = fields[cells.topic[numbers]].T
-    are_in_view: Flags = (distance <= far) & (bearing >= left) & (bearing <= right)
+    far, middle, left, right = fields[cells.topic[numbers]].T
+    beside = half_turns(bearing - middle)
+    are_in_view: Flags = (distance <= far) & (beside >= left) & (beside <= right)
     return are_in_view
+
+
+def half_turns(degrees: Floats) -> Floats:
+    """Returns angles as at most half a turn to either side: -180 to below 180 degrees."""
+    return (degrees + 180.0) % 360.0 - 180.0
 
 
 _BITS: Final = 32

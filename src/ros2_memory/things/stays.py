@@ -36,7 +36,7 @@ from ros2_memory.core.arrays import (
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
 from ros2_memory.things.places import Sightings, poorly_localised
-from ros2_memory.things.presence import Cells, Evidence, Stay
+from ros2_memory.things.presence import Cells, Evidence, Stay, half_turns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -136,17 +136,22 @@ class Observations:
 
 
 def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
-    """Returns how far (mm), and from and to which directions (degrees), each detector sees.
+    """Returns how far (mm) each detector sees, in which direction, and how far to both sides of it.
 
-    Nearly all detections of its topic lie there. `topics` is the number of topics; `n` has the
-    detections at each distance and bearing. The field of a topic without detections is -1.
+    Angles are in degrees. Nearly all detections of its topic lie there. `topics` is the number of
+    topics; `n` has the detections at each distance and bearing. The field of a topic without
+    detections is -1.
     """
-    fields = np.full((topics, 3), -1.0)
+    fields = np.full((topics, 4), -1.0)
+    toward = np.exp(1j * np.radians(bearing))
     for number in np.flatnonzero(np.bincount(topic)).tolist():
         rows = topic == number
         [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
-        sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
-        fields[number] = far, *sides
+        # A camera that looks back sees from 150 to -150 degrees, not all between.
+        middle = round(np.degrees(np.angle(toward[rows] @ n[rows])))
+        beside = half_turns(bearing[rows] - middle)
+        sides = _weighted_quantiles(beside, n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
+        fields[number] = far, middle, *sides
     return fields
 
 

@@ -159,6 +159,24 @@ def test_a_camera_that_is_turned_away_by_its_own_joint_misses_nothing(
     assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
 
 
+@pytest.mark.parametrize("heading", [0.0, math.pi])
+def test_a_camera_that_looks_back_misses_nothing_beside_its_field_of_view(
+    tmp_path: Path, heading: float
+) -> None:
+    """The same things, seen by a camera in front and by one that looks back."""
+
+    def thing(label: str, bearing_deg: float) -> Seen:
+        bearing = math.radians(bearing_deg)
+        return label, 1.0 + 3.0 * math.cos(bearing), 3.0 * math.sin(bearing)
+
+    cup = thing("cup", 33.0)
+    others = [thing("book", 0.0), thing("plant", 12.0), thing("fork", -33.0)]
+    before, after = ((1.0, 0.0, heading + math.radians(turned_deg)) for turned_deg in (3.0, -2.0))
+    seen = [*looked(0, 60, before, cup, *others), *looked(60, 160, after, *others)]
+    [cup_then] = told_of(tmp_path, seen, label="cup")["things"]
+    assert cup_then["still_there"] == {"not_looked_at_since": BEGIN + 59}
+
+
 @pytest.mark.parametrize("lost", [math.nan, math.inf])
 def test_a_thing_that_is_detected_without_a_place_is_not_missed(
     tmp_path: Path, lost: float

@@ -140,7 +140,7 @@ _looks = st.lists(
 
 _unplaced = st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3)
 UNPLACED: Final[Any] = {"unplaced": [whole([]).unplaced[:]], "label": np.zeros(2, np.int64)}
-_ANYWHERE = np.array([[1e9, -180.0, 180.0]])
+_ANYWHERE = np.array([[1e9, 0.0, -180.0, 180.0]])
 
 
 @given(_looks, _unplaced)
