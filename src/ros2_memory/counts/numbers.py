@@ -537,7 +537,6 @@ def count_range(
         return count_values(view, name, asked, fields=fields)
     binned = BinnedWindow(view, asked, by, (name,))
     names = tuple(dict.fromkeys(fields))
-    note_no_fix(view, name, asked, names)
     size = len(binned.bins.names)
     if len(names) * size > MOST_CELLS:
         raise InvalidArgumentsError(
@@ -561,6 +560,7 @@ def count_range(
             values = [None if cell is None else getattr(cell, column) for cell in cells]
             binned.add(f"{field}.{column}", kind, values, getattr(window_cell, column))
     note_robots(view, name, binned.counted)
+    note_no_fix(view, name, binned.counted, names)
     return binned.answer()
 
 

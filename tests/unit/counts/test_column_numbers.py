@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
@@ -15,7 +16,7 @@ from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
-from tests.support.bags import Msg, battery, make, odom, text, write_mcap, write_splits
+from tests.support.bags import Msg, battery, header, make, odom, text, write_mcap, write_splits
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.tables import table
@@ -125,6 +126,34 @@ def test_no_number_is_lost_where_time_runs_out_while_a_table_is_counted(tmp_path
         write_mcap(tmp_path / "other" / f"other_{begin}.mcap", CHARGES[1::2][begin:end])
     memory = with_store(memory_of(tmp_path, limits=LATEST), tmp_path, share=0.0)
     assert len(sizes_counted(memory, range(1, 40, 3))) > 1
+
+
+def fix(at: int, altitude: float) -> Msg:
+    kind = "sensor_msgs/msg/NavSatFix"
+    body = make(
+        kind,
+        header=header(at, "gps"),
+        status=make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
+        latitude=48.0,
+        longitude=11.0,
+        altitude=altitude,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+    return Msg("/fix", kind, at, body)
+
+
+def test_heights_of_a_receiver_are_counted_as_far_as_there_is_time(tmp_path: Path) -> None:
+    """The search for messages without a fix leaves the time to the numbers."""
+    write(tmp_path, [fix(BEGIN + n * 10 * S, float(n)) for n in range(200)])
+    span = TimeRange(BEGIN / S, BEGIN / S + HOUR)
+    least = set()
+    for looks in range(1, 33):
+        memory, call = memory_of(tmp_path, limits=LATEST), Call(deadline=limited(looks))
+        with suppress(QueryTimeoutError):
+            answer = count_range(memory, call, "/fix", span, "hour", fields=["altitude"])
+            least.add(cells(answer, "altitude.min")[-1])
+    assert least == {float(n) for n in range(0, 200, 20)}
 
 
 @in_zone("UTC")
