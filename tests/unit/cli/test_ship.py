@@ -206,6 +206,8 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     odd = "0.5 a, 1e999::DOUBLE b, MAP{'x': 1} c, '\\x01'::BLOB d, DATE '2026-11-20' e"
     [row] = json.loads(exits(0, "sql --json", f"SELECT {odd}", *of_lake).out)
     assert row == {"a": 0.5, "b": None, "c": {"x": 1}, "d": "01", "e": "2026-11-20"}
+    printed = exits(0, "sql", "SELECT 1500000000.25::DOUBLE AS mean_ns, NULL AS b", *of_lake).out
+    assert printed.split() == ["mean_ns", "b", "1500000000.25", "-"]  # it is no time
     assert "two columns have one name" in exits(2, "sql 'SELECT 1 AS a, 2 AS a'", *of_lake).err
     assert exits(0, "sql --csv 'SELECT 1 AS a, 2 AS a'", *of_lake).out == "a,a\n1,2\n"
     with monkeypatch.context() as patch:
