@@ -1,6 +1,5 @@
 """`ros2-memory cat`: the messages of one topic, as lines for people, CSV, or JSON lines."""
 
-import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
@@ -138,10 +137,7 @@ def _csv_lines(rows: Iterable[Row]) -> Iterator[str]:
     columns: list[str] | None = None
     without_column: set[str] = set()
     for time, value in rows:
-        cells: dict[str, object] = {}
-        for path, inner in leaves(value):
-            cell = to_json_text(inner) if isinstance(inner, list) else json.dumps(inner)
-            cells[path or "value"] = inner if isinstance(inner, str | None) else cell
+        cells = {path or "value": inner for path, inner in leaves(value)}
         if columns is None:
             columns = [*cells]
             yield csv_line(["time", *columns])

@@ -22,6 +22,7 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.text import dotted
 from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -59,11 +60,17 @@ def print_exactly(lines: Iterable[str]) -> int:
     return count
 
 
-def csv_line(cells: Iterable[object]) -> str:
-    """Returns a row of CSV, without the line's end."""
+def csv_line(cells: Iterable[JsonValue]) -> str:
+    """Returns a row of CSV, without the line's end: texts as they are, all else as JSON."""
     line = StringIO()
-    csv.writer(line, lineterminator="").writerow(cells)
+    csv.writer(line, lineterminator="").writerow(map(_csv_cell, cells))
     return line.getvalue()
+
+
+def _csv_cell(value: JsonValue) -> str | None:
+    if isinstance(value, str | None):
+        return value
+    return to_json_text(value) if isinstance(value, list | dict) else json.dumps(value)
 
 
 @contextmanager

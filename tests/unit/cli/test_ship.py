@@ -1,5 +1,6 @@
 """`ros2-memory ship`: one pass, who writes, what is missing, and no secret anywhere."""
 
+import csv
 import importlib.util
 import json
 import os
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +212,9 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     assert printed.split() == ["mean_ns", "b", "1500000000.25", "-"]  # it is no time
     assert "two columns have one name" in exits(2, "sql 'SELECT 1 AS a, 2 AS a'", *of_lake).err
     assert exits(0, "sql --csv 'SELECT 1 AS a, 2 AS a'", *of_lake).out == "a,a\n1,2\n"
+    nested = "SELECT true AS a, [1, NULL] AS b, MAP{'x': 1} AS c, NULL AS d"
+    [_, line] = csv.reader(StringIO(exits(0, "sql --csv", nested, *of_lake).out))
+    assert line == ["true", "[1,null]", '{"x":1}', ""]  # as in JSON
     with monkeypatch.context() as patch:
         patch.setattr(sys.stdout, "isatty", lambda: True)
         assert exits(0, "sql --csv 'SELECT chr(27) AS a'", *of_lake).out == "a\n\\x1b\n"
