@@ -112,6 +112,7 @@ from ros2_memory.places.pose_frames import (
     placed_waypoints,
     pose_in_map,
     with_place,
+    with_runs,
 )
 from ros2_memory.things.unseen import notes_on_never
 
@@ -647,7 +648,7 @@ def trajectory_summary(
     view.notes.add(*axes_of(frame_id or own_frame))
     elapsed = elapsed_in(view, window)
     # The least line has two ends: fewer waypoints are cut from it.
-    whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
+    whole = with_runs(view, name, path, path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE)))
     shown = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
     if max_waypoints < _FEWEST_OF_A_LINE:
         last = shown.waypoints[-1:] if max_waypoints else ()

@@ -291,10 +291,10 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         )
     if totals.gaps:
         without = "without a valid pose" if path.invalid else "without a pose"
-        yield (
-            f"{counted(totals.gaps, 'gap')} {without}, {totals.gap_m:.2f} m across in straight "
-            "lines (gap_m): left out of distance_m"
-        )
+        across = f", {totals.gap_m:.2f} m across in straight lines (gap_m): left out of distance_m"
+        if totals.known_gap_m is None:
+            across = ": left out of distance_m, and of unknown length, as odometry began anew"
+        yield f"{counted(totals.gaps, 'gap')} {without}{across}"
     if totals.jumps:
         yield (
             f"{counted(totals.jumps, 'jump')} of {totals.jumped_m:.2f} m in all, faster than is "

@@ -48,7 +48,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.places.pose_frames import NEWEST_POSE_NS
+from ros2_memory.places.pose_frames import NEWEST_POSE_NS, with_runs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -154,7 +154,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
         return Drive(elapsed, None, None, standstills, drops)
-    trajectory = across_steps(path.trajectory(0), path, elapsed)
+    trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
     known = reached(view.snapshot, TimeWindow(begin, window.stop))
     spans = without([known.asked()], [*recording_gaps(view, known)])
     recorded = elapsed.among(spans)

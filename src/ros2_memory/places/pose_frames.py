@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.trajectory import Waypoint
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, Waypoint
     from ros2_memory.core.arrays import Flags
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.stored_message import StoredMessage
@@ -366,6 +366,15 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
             "coordinates may be another place in each"
         )
+
+
+def with_runs(view: View, topic: str, path: PathSlice, trajectory: Trajectory) -> Trajectory:
+    """Returns the trajectory of a path; what lies across its gaps is unknown between two runs."""
+    totals, window = trajectory.totals, TimeWindow(path.first, path.last + 1)
+    is_in_map = set(path.frames) == {view.limits.map_frame}
+    if not totals.gaps or is_in_map or is_one_run(view, topic, [window]):
+        return trajectory
+    return replace(trajectory, totals=replace(totals, are_gaps_between_runs=True))
 
 
 def axes_of(frame_id: str) -> tuple[str, ...]:

@@ -426,3 +426,25 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
     for end, goes_on in ((15, True), (40, False), (60, False)):
         events = over(memory_of(tmp_path), 0, end).events
         assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
+
+
+@pytest.mark.parametrize("map_frame", ["odom", "map"])
+def test_how_far_it_is_across_a_gap_is_unknown_where_odometry_began_anew(
+    tmp_path: Path, map_frame: str
+) -> None:
+    """It drives 6 m; the next recording begins at 2 m, of another origin if not in the map."""
+    begin = 1_700_000_000 * S
+    legs = [[odom(begin + n * S // 10, n / 50) for n in range(300)]]
+    legs.append([odom(begin + (60 + n) * S, 2.0) for n in range(30)])
+    for number, leg in enumerate(legs):
+        write_splits(tmp_path / "several", leg, 1000.0, f"run{number}")
+    write_splits(tmp_path / "one", [*legs[0], *legs[1]], 1000.0, "run")
+    window = {"start": begin / S, "end": begin / S + 100}
+    for folder, is_known in (("several", map_frame == "odom"), ("one", True)):
+        memory = memory_of(tmp_path / folder, limits=QuerySettings(map_frame=map_frame))
+        for tool in ("recap", "trajectory_summary"):
+            reply = asked(memory, tool, **window)
+            assert reply["distance_m"] == pytest.approx(5.98, abs=0.05)
+            assert reply.get("gap_m") == (pytest.approx(3.98, abs=0.01) if is_known else None)
+            (note,) = [note for note in reply["notes"] if "1 gap without a pose" in note]
+            assert ("across in straight lines" in note) == is_known
