@@ -320,6 +320,10 @@ class Triggers:
         moment.stored = True
         if refused is not None:
             self._refuse(name, record, refused)
+            if not moment.known:
+                # What saved nothing does not count in `max_per_hour`.
+                first, last = moment.start, moment.end
+                record.begun = [at for at in record.begun if not first <= at <= last]
             return False
         if not moment.known:
             record.moments += 1

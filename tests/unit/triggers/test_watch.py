@@ -191,6 +191,18 @@ def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
     assert "max_per_hour: 3" in said["reason"]
 
 
+def test_moments_that_are_refused_for_their_size_do_not_count_in_the_hour(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule(max_bytes=1, max_per_hour=2))
+    robot.begin(T0)
+    for begin in range(0, 100, 10):
+        robot.split(seconds(begin, begin + 10, {5, 35, 65, 95}))
+        robot.look()
+    robot.close_all()
+    record = robot.record()
+    assert (record.fired, record.moments, record.refused) == (4, 0, 4)
+    assert "raise max_gb of the rule" in (record.problem or "")
+
+
 def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> None:
     robot.begin(T0)
     for begin in range(0, 4000, 1000):
