@@ -198,7 +198,8 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
     The latter is left out if only `explained` gaps are wanted. Times that were deleted or excluded
     are no gaps: they were recorded. An interruption after the newest data has a sentence, too.
     """
-    bag_dir, snapshot, gaps = view.bag_dir, view.snapshot, view.gaps(window)
+    bag_dir, snapshot = view.bag_dir, view.snapshot
+    gaps = [gap for gap in view.gaps(window) if is_missed(snapshot, window, *gap)]
     interruptions = [
         loss for loss in read_losses(bag_dir, MIN_NS, MAX_NS) if loss.by in INTERRUPTIONS
     ]
@@ -663,6 +664,16 @@ def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show; see `recorded_reach`."""
     first, last = recorded_reach(snapshot, window) or (window.start, window.stop - 1)
     return window.intersect(TimeWindow(first, last + 1))
+
+
+def is_missed(snapshot: Snapshot, window: TimeWindow, start: Ns, end: Ns) -> bool:
+    """Whether a window misses something by a gap: more than an ordinary pause, or all it has.
+
+    Whoever asks about a whole hour is not told of the gap that begins with its last message.
+    """
+    first, last = window.asked()
+    begin, stop = max(start, first), min(end, last)
+    return stop - begin > snapshot.shortest_gap or (begin, stop) == (first, last)
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:

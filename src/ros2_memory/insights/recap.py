@@ -26,6 +26,7 @@ from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     deleted_between,
+    is_missed,
     note_edges,
     note_unread,
     note_unrecorded,
@@ -418,7 +419,8 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
         text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
         yield Event("drop", time, None, text)
     for begin, until in unexcluded(view, recording_gaps(view, TimeWindow(*window.asked()))):
-        yield Event("gap", begin, until, _gap_sentence(view, begin, until))
+        if is_missed(view.snapshot, window, begin, until):
+            yield Event("gap", begin, until, _gap_sentence(view, begin, until))
     for at, by in clock_steps(view, window):
         how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
         yield Event("clock step", at, None, f"the clock was set {how}")

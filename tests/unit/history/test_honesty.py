@@ -562,6 +562,18 @@ def test_a_cause_is_said_of_the_interruption_and_not_of_the_whole_gap(apart: Pat
     assert "60 s" not in doubts
 
 
+@pytest.mark.parametrize(
+    ("start", "end", "is_told"), [(99.99, 110, False), (0, 20.01, False), (95, 110, True)]
+)
+def test_a_gap_that_only_touches_a_window_is_no_gap_of_it(
+    apart: Path, start: float, end: float, is_told: bool
+) -> None:
+    window = {"start": BEGIN + start, "end": BEGIN + end}
+    driven, recap = ask(apart, "trajectory_summary", **window), ask(apart, "recap", **window)
+    assert ("nothing was recorded" in str(driven.get("notes"))) is is_told
+    assert ("nothing was recorded" in str(recap["events"])) is is_told
+
+
 def test_what_was_excluded_was_recorded(apart: Path) -> None:
     exclude(apart, 20, 100)
     interrupted(apart, 98, 102, "unclean")
