@@ -27,8 +27,8 @@ mean square successive difference", Ann. Math. Statist. 12 (1941).
 Sudden losses of speed are found in the first poses of slots of `DROP_SLOT_NS`. The robot goes
 `MOVING_MPS` or faster from slot to slot. Then its speed falls, within two slots, to `FRACTION` of
 that or less, and stays there for two slots. If it turns meanwhile, or in the two slots after these,
-it slows down on purpose, as nearly all robots do. A drop depends on `_DROP_SLOTS` slots in a row: poses that come less often
-than once a slot, and a position that jumps for a moment, show none.
+it slows down on purpose, as nearly all robots do. A drop depends on `_DROP_SLOTS` slots in a row:
+poses that come less often than once a slot, and a position that jumps for a moment, show none.
 """
 
 from __future__ import annotations
