@@ -183,13 +183,16 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     for loss in losses:
         if loss.by == "refused":
             refused[loss.topic].append((loss.start, loss.stop - 1))
-    for topic in sorted(refused)[:MAX_NAMED]:
+    topics = sorted(refused)
+    for topic in topics[:MAX_NAMED]:
         spans = [_span_text(*span) for span in united(refused[topic], _EDGE_NS)]
         yield (
             f"messages of a publisher of {topic} were not recorded from "
             f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS or type did not fit the "
             "subscription: how many is not known"
         )
+    if others := topics[MAX_NAMED:]:
+        yield f"for the same reason messages were not recorded of publishers of {listed(others)}"
 
 
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:

@@ -113,6 +113,16 @@ def test_what_was_lost_is_a_doubt(
     assert (told["doubts"], told["lost_last_hour"]) == (doubts, {"/odom": 7})
 
 
+def test_each_topic_with_a_refused_publisher_is_named_or_counted(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    topics = [f"/sensor_{nth}" for nth in range(8)]
+    append_losses(tmp_path, [lost("refused", 10, 20, topic=topic) for topic in topics])
+    samples = asked(memory, "get_topic_in_range", topic="/odom", start=T0, end=T0 + 30)
+    for said in (shown(memory)["doubts"], str(samples["notes"])):
+        assert said.count("messages of a publisher of") == 3
+        assert "of publishers of /sensor_3, /sensor_4, /sensor_5 and 2 more" in said
+
+
 def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     tmp_path: Path,
 ) -> None:
