@@ -365,6 +365,21 @@ def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: 
     assert labels(0, 5) == {}
 
 
+def test_sightings_are_of_the_label_in_its_spellings_and_of_no_longer_word(tmp_path: Path) -> None:
+    """A thing has one name for all spellings; `cup` is no part of `cupboard`."""
+    seen = ["cup", "cupboard", "Cups", "coffee_mug", "0", "10"]
+    messages = [
+        detections(BEGIN + n * S, [seen[n // 20]] if n % 20 < 5 else [])
+        for n in range(20 * len(seen))
+    ]
+    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    for label, begins in (("cup", [40, 0]), ("coffee mug", [60]), ("0", [80])):
+        query = QueryParams(f"label={label}&start={BEGIN_S - 1}&end={BEGIN_S + 200}")
+        found = received(moment_reply(query, memory, Call()))
+        assert [row["first_seen"] - BEGIN_S for row in found["sightings"]] == begins
+        assert found["total"] == len(begins)
+
+
 def off_line(path: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far each point is from the nearest line that is drawn."""
     x, y = np.array(path["x"]), np.array(path["y"])

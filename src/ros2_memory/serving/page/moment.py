@@ -10,6 +10,7 @@ from ros2_memory.insights.changes_before import recap_before
 from ros2_memory.insights.recap import events_by_topic, recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.serving.page.span import EVENT, SUMMARY
+from ros2_memory.things.labels import Labels
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -88,28 +89,32 @@ def _seen(summary: Recap) -> list[JsonValue]:
 def sightings_shown(
     memory: Memory, call: Call, label: str, start_s: float, end_s: float
 ) -> JsonObject:
-    """Returns the newest sightings of a label, over all detectors.
+    """Returns the newest sightings of a label in all its spellings, over all detectors.
 
     Raises:
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
     view, window = open_span(memory, call, TimeRange(start_s, end_s))
-    detectors = [
-        topic
+    key_of = Labels(memory.limits.labels).key
+    spellings = [
+        (topic, spelling)
         for topic, events in events_by_topic(view, window).items()
         if events is not None and events.visible.size
+        for spelling in sorted({label, *events.visible.labels})
+        if key_of(spelling) == key_of(label)
     ]
     rows: list[JsonObject] = []
     notes: list[str] = []
     total: int | None = 0  # None when one of them is not known
-    for topic in detectors:
+    for topic, spelling in spellings:
         sightings = find_matches(
             memory,
             call,
             topic,
-            "contains",
-            label,
+            # The name of a class may be its number, which coordinates may equal.
+            "contains_word" if spelling.isdecimal() else "equals",
+            spelling,
             start_s=start_s,
             end_s=end_s,
             limit=MOST_SIGHTINGS,
