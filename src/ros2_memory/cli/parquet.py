@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
@@ -22,6 +23,7 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S
@@ -86,6 +88,7 @@ class Dataset:
 
     Args:
         root: the folder; partitions that exist already are refused.
+        bag_dir: the folder of the recordings.
         reader: decodes the messages.
         extractor: reads values and poses of decoded messages.
         robot: the name of a further partition, so that many robots share a dataset; None for a
@@ -98,6 +101,7 @@ class Dataset:
     """
 
     root: Path
+    bag_dir: Path
     reader: BagReader
     extractor: SchemaExtractor
     robot: str | None
@@ -112,13 +116,13 @@ class Dataset:
             InvalidArgumentsError: a partition exists already, or the existing ones are by robot and
                 these are not, or the reverse.
         """
-        folder = self._partitions_folder()
+        folder, name_of = self._partitions_folder(), cache(self._name_of)
         open_parts: dict[tuple[str, int], _PartFile] = {}  # the one used last stands last
         temporary_by_path: dict[Path, Path] = {}
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as temporary:
             for stored in messages:
-                partition = stored.bag.recording.name, stored.time // NS_PER_DAY
+                partition = name_of(stored.bag.recording), stored.time // NS_PER_DAY
                 part = open_parts.pop(partition, None)
                 if part is None:
                     if len(open_parts) == _MAX_OPEN_FILES:
@@ -135,6 +139,13 @@ class Dataset:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 temporary_file.replace(path)
         self.files = len(temporary_by_path)
+
+    def _name_of(self, recording: Path) -> str:
+        """Returns a recording's path in the bag directory, without the folder of a saved moment."""
+        if recording == self.bag_dir:
+            return recording.name
+        recorded = HardLinks(self.bag_dir).recorded_as(str(recording))
+        return recorded.removeprefix(f"{self.bag_dir}/")
 
     def _partitions_folder(self) -> Path:
         """Returns the folder of the partitions by recording.

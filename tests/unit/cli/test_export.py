@@ -202,6 +202,14 @@ def test_a_dataset_has_robots_or_has_none(bag_dir: Path, tmp_path: Path, exits: 
         assert {*rows.rglob("*")} == files
 
 
+def test_recordings_of_one_name_in_two_folders_stay_apart(tmp_path: Path, exits: Program) -> None:
+    for number, mission in enumerate(("a", "b", "moments/20261120T043000Z-x/b")):
+        write_mcap(tmp_path / "bags" / mission / "bag" / "bag_0.mcap", driven(T0 + number, number))
+    exits(0, f"export --parquet {tmp_path}/rows {tmp_path}/bags")
+    found = queried(tmp_path / "rows", "SELECT DISTINCT recording FROM memory ORDER BY recording")
+    assert found == [("a/bag",), ("b/bag",)]
+
+
 def test_what_cannot_be_decoded_has_a_row_that_says_why(tmp_path: Path, exits: Program) -> None:
     odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
     layout = McapLayout(definitions=False)
