@@ -50,7 +50,7 @@ from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.stored_message import StoredMessage
@@ -116,6 +116,11 @@ class _LabelDetections(NamedTuple):
     last_unplaced: Ns
     last_placed: Ns
     at_once: int
+
+    @property
+    def total(self) -> int:
+        """How often it was detected."""
+        return self.counted + self.low + self.unplaced
 
 
 def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
@@ -230,16 +235,13 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
     if not question.labels:
         yield from unplaced_notes(known, (question.window,))
         yield from _low_score_notes(known, question)
-    for key, label in question.labels.items():
-        about = f"{abbreviate(label)}: " if len(question.labels) > 1 else ""
-        for note in _label_notes(known, key, question):
-            yield still_quoted(about + note, note)
+    yield from _notes_on_labels(known, question)
 
 
 def _low_score_notes(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:
     """Yields which labels were only detected with too low a score, of all that were not found."""
     others = sorted(known.estimate.names.keys() - question.found)
-    detections = [*_detections_of(known, others, question.window)]
+    detections = _detections_of(known, others, question.window).values()
     named = [
         f"{label.name} ({counted(label.low, 'time')})"
         for label in detections
@@ -287,7 +289,7 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
     """
     yield from _too_many_labels_note(known)
     for window in windows:
-        labels = [*_detections_of(known, sorted(known.estimate.names), window)]
+        labels = _detections_of(known, sorted(known.estimate.names), window).values()
         unplaced = [
             f"{label.name} ({counted(label.unplaced, 'time')}, "
             f"from {unix_text(label.first_unplaced)} to {unix_text(label.last_unplaced)})"
@@ -343,21 +345,28 @@ def _rows_during(window: TimeWindow, table: Columns, first: int, last: int) -> I
 
 
 def _detections_of(
-    known: KnownThings, keys: Iterable[str], window: TimeWindow
-) -> Iterator[_LabelDetections]:
-    """Yields how often each label was detected in a window, by the labels' keys."""
-    estimate, every = known.estimate, known.estimate.unplaced
+    known: KnownThings, keys: Collection[str], window: TimeWindow
+) -> dict[str, _LabelDetections]:
+    """Returns how often labels were detected in a window, by their keys.
+
+    All spots are looked through once, so ask about all labels together.
+    """
+    if not keys:
+        return {}
+    estimate = known.estimate
     during = _rows_during(window, estimate.spots, Spot.FIRST, Spot.LAST)
-    unplaced = every[_rows_during(window, every, Unplaced.FIRST, Unplaced.LAST)]
+    lost_then = _rows_during(window, estimate.unplaced, Unplaced.FIRST, Unplaced.LAST)
+    unplaced = estimate.unplaced[lost_then]
     names, key_of_label = numbered(map(known.labels.key, estimate.labels))
     number_of = {key: number for number, key in enumerate(names)}
     rows_of = rows_by(key_of_label[estimate.spots[during, Spot.LABEL]], len(names))
     unplaced_rows_of = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(names))
+    detections: dict[str, _LabelDetections] = {}
     for key in keys:
         number = number_of[key]
         rows, lost = during[rows_of[number]], unplaced[unplaced_rows_of[number]]
         spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
-        yield _LabelDetections(
+        detections[key] = _LabelDetections(
             name=estimate.names[key],
             counted=count,
             low=int(spots[:, Spot.N].sum()) - count,
@@ -367,14 +376,37 @@ def _detections_of(
             last_placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
             at_once=int(spots[:, Spot.TOGETHER].max(initial=0)),
         )
+    return detections
 
 
-def _label_notes(known: KnownThings, key: str, question: ThingsQuestion) -> Iterator[str]:
-    """Yields notes on a label that was asked for."""
-    if key not in known.estimate.names:
-        yield from _too_many_labels_note(known) or _similar_labels(known, key, question.labels[key])
-        return
-    [in_window] = _detections_of(known, [key], question.window)
+def _notes_on_labels(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:
+    """Yields notes on each label that was asked for."""
+    window, labels = question.window, question.labels
+    reported = [key for key in labels if key in known.estimate.names]
+    too_many = _too_many_labels_note(known) if len(reported) < len(labels) else []
+    in_window = _detections_of(known, reported, window)
+    absent = [key for key in reported if not in_window[key].total]
+    in_all = _detections_of(
+        known, absent if known.reaches_back(window) else (), TimeWindow.everything()
+    )
+    for key, label in labels.items():
+        about = f"{abbreviate(label)}: " if len(labels) > 1 else ""
+        if key in in_window:
+            notes = _detection_notes(known, question, key, in_window[key], in_all.get(key))
+        else:
+            notes = iter(too_many) if too_many else _similar_labels(known, key, label)
+        for note in notes:
+            yield still_quoted(about + note, note)
+
+
+def _detection_notes(
+    known: KnownThings,
+    question: ThingsQuestion,
+    key: str,
+    in_window: _LabelDetections,
+    in_all: _LabelDetections | None,
+) -> Iterator[str]:
+    """Yields notes on the detections of a label; `in_all` if the window has none of it."""
     unplaced = in_window.unplaced
     if unplaced:
         lost = counted(unplaced, "detection")
@@ -390,10 +422,8 @@ def _label_notes(known: KnownThings, key: str, question: ThingsQuestion) -> Iter
             f"it was detected {times} in this time, but does not count "
             f"as a thing{question.bounds}: find_matches lists single detections"
         )
-    is_in_window = in_window.counted or in_window.low or unplaced
-    if not is_in_window and known.reaches_back(question.window):
-        [in_all] = _detections_of(known, [key], TimeWindow.everything())
-        times = counted(in_all.counted + in_all.low + in_all.unplaced, "time")
+    if in_all is not None:
+        times = counted(in_all.total, "time")
         when = known.reach or " in all"
         yield f"it was detected {times}{when}, and not once in this window"
 

@@ -8,11 +8,13 @@ from itertools import count
 from pathlib import Path
 from random import Random
 from typing import Any, TypeVar
+from unittest.mock import Mock
 
 import pytest
 
 from ros2_memory.analysis import sights
 from ros2_memory.columns.scanner import Scanner
+from ros2_memory.core.arrays import rows_by
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.core.text import abbreviate
@@ -90,6 +92,23 @@ def told_of(bag_dir: Path, messages: Sequence[Msg], **given: Any) -> Any:
     """The reply about what is seen in some messages."""
     write_splits(bag_dir, messages)
     return ask(bag_dir, **given)
+
+
+def test_a_question_for_many_labels_looks_through_all_spots_as_often_as_one_for_two(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twice: for the time that was asked about, where all are absent, and for all time."""
+    labels = [f"part {nth}" for nth in range(20)]
+    parts = [(label, 2.0, 0.0) for label in labels]
+    write_splits(tmp_path, [*looked(0, 30, HERE, *parts), *looked(60, 90, HERE)])
+    looks = Mock(wraps=rows_by)
+    monkeypatch.setattr(unseen, "rows_by", looks)
+    for asked_for in (labels[:2], labels):
+        looks.reset_mock()
+        found = ask(tmp_path, label=asked_for, start=BEGIN + 60)
+        missed = [note for note in found["notes"] if "and not once in this window" in note]
+        assert len(missed) == len(asked_for)
+        assert looks.call_count == 2 * 2  # what has a place, and what has none
 
 
 @pytest.mark.parametrize(("recalls", "map_off"), [(False, None), (True, 0.6)])
