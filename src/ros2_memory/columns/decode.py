@@ -321,6 +321,7 @@ class Group:
 
     def take(self, other: Group) -> None:
         """Adds all messages of another bag."""
+        # Decoded ones before those that wait: `join_tables` puts rows in order of time.
         for key, tables in other._tables.items():
             self._tables.setdefault(key, []).extend(tables)
         self.memory_bytes += other.memory_bytes

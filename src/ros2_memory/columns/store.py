@@ -497,7 +497,9 @@ class ColumnStore(Database):
 
         def write(connection: sqlite3.Connection) -> None:
             connection.execute("DELETE FROM listing")
-            connection.executemany("INSERT INTO listing VALUES (?, ?)", listings.items())
+            connection.executemany(
+                "INSERT INTO listing (folder, listed) VALUES (?, ?)", listings.items()
+            )
 
         if self.listings() == listings:
             return True

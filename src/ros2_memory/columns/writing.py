@@ -326,12 +326,16 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
     """Inserts a bag; returns its id."""
     key, bag, hashed, _ = to_store
     summary = _find_or_insert(connection, "summary", topics=bag.summary.schema.to_json())
-    cursor = connection.execute(
-        "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
-        " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, _messages_of(bag), hashed, definitions, summary, bag.summary.data),
+    return _insert(
+        connection,
+        "bag",
+        **key._asdict(),
+        messages=_messages_of(bag),
+        hashed=hashed,
+        definitions=definitions,
+        summary=summary,
+        counts=bag.summary.data,
     )
-    return int(cursor.lastrowid or 0)
 
 
 def insert_bags(
@@ -373,17 +377,24 @@ def insert_bags(
 
 
 def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, level: Level) -> int:
-    cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes, level)"
-        " VALUES (?, ?, ?, ?, ?, '', ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, level),
+    number = _insert(
+        connection,
+        "part",
+        topic=topic,
+        first_ns=part.first,
+        last_ns=part.last,
+        messages=part.messages,
+        bags=json.dumps(part.bags),
+        dropped="",
+        bytes=part.size,
+        level=level,
     )
-    number = int(cursor.lastrowid or 0)
     for path, packed in part.columns.items():
         least, greatest, nulls, words = packed.zone
         zone = (_bound(least), _bound(greatest), nulls, words)
         connection.execute(
-            "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO zone (topic, path, part, codec, count, error, least, greatest, nulls,"
+            " words) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (topic, path, number, packed.codec, packed.count, packed.error, *zone),
         )
         # Numbers that are all rounded to one take no bytes, but are no constant.
@@ -391,7 +402,8 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, l
             first = part.path_of_data.get(packed.data, path)
             same, data = (None, packed.data) if first == path else (first, None)
             connection.execute(
-                "INSERT INTO part_column VALUES (?, ?, ?, ?)", (number, path, same, data)
+                "INSERT INTO part_column (part, path, same, data) VALUES (?, ?, ?, ?)",
+                (number, path, same, data),
             )
     return number
 
@@ -455,9 +467,15 @@ def _find_or_insert(connection: sqlite3.Connection, table: str, **values: str | 
     row = connection.execute(f"SELECT id FROM {table} WHERE {where}", given).fetchone()
     if row is not None:
         return int(row[0])
-    names, marks = ", ".join(values), ", ".join("?" * len(given))
-    cursor = connection.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", given)
-    return int(cursor.lastrowid or 0)
+    return _insert(connection, table, **values)
+
+
+def _insert(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:
+    """Inserts a row; returns its id."""
+    names, marks = ", ".join(values), ", ".join("?" * len(values))
+    query = f"INSERT INTO {table} ({names}) VALUES ({marks}) RETURNING id"
+    [(number,)] = connection.execute(query, tuple(values.values()))
+    return int(number)
 
 
 def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
