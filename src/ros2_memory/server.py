@@ -18,7 +18,7 @@ import os
 import signal
 import sys
 import threading
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory import package_version
@@ -262,22 +262,23 @@ def _parts_of_fleet(
     from ros2_memory.serving.backfill import keep_all_backfilled
     from ros2_memory.serving.health import FleetHealth, Health
 
-    reports: dict[str, Health] = {}
-    backfills: dict[str, Backfill] = {}
-    for name in settings.fleet.robots:  # the others have bags in the lake alone
+    @cache
+    def backfill_of(name: str) -> Backfill:
         robot = fleet.robots[name]
         backfill = build_backfill(robot_settings(settings, name), robot.memory)
-        reports[name] = Health(robot.own or robot.memory, package_version(), backfill)
         if not robot.in_lake:  # the helper reads bags of a bag directory, not of a lake
             options = "--bag-dir", str(robot.bag_dir.absolute())
             backfill.helper = _helper_command(overrides, *options)
-        backfills[name] = backfill
+        return backfill
 
     def all_backfills() -> list[Backfill]:
-        for name, robot in [*fleet.robots.items()]:  # more robots may have joined
-            if name not in backfills:
-                backfills[name] = build_backfill(settings, robot.memory)
-        return [*backfills.values()]
+        return [*map(backfill_of, [*fleet.robots])]  # more robots may have joined
+
+    reports: dict[str, Health] = {}
+    for name in settings.fleet.robots:  # the others have bags in the lake alone
+        robot = fleet.robots[name]
+        bags = robot.own or robot.memory
+        reports[name] = Health(bags, package_version(), backfill_of(name))
 
     async def background() -> None:
         """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
