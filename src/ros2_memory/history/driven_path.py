@@ -292,8 +292,10 @@ def length_notes(path: Trajectory) -> Iterator[str]:
     if totals.gaps:
         without = "without a valid pose" if path.invalid else "without a pose"
         across = f", {totals.gap_m:.2f} m across in straight lines (gap_m): left out of distance_m"
-        if totals.known_gap_m is None:
-            across = ": left out of distance_m, and as odometry may have begun anew, unknown"
+        if path.gap_m is None:
+            across = (
+                ": left out of distance_m, and of unknown length, as odometry may have begun anew"
+            )
         yield f"{counted(totals.gaps, 'gap')} {without}{across}"
     if totals.jumps:
         yield (

@@ -272,7 +272,7 @@ def _with_path(view: View, answer: Recap, drive: Drive) -> Recap:
         distance_m=trajectory.totals.distance_m,
         max_speed=trajectory.max_speed,
         path_sum_m=trajectory.totals.path_sum_m if trajectory.is_noisy else None,
-        gap_m=trajectory.totals.known_gap_m,
+        gap_m=trajectory.gap_m,
     )
 
 

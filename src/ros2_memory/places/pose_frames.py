@@ -370,11 +370,11 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
 
 def with_runs(view: View, topic: str, path: PathSlice, trajectory: Trajectory) -> Trajectory:
     """Returns the trajectory of a path; what lies across its gaps is unknown between two runs."""
-    totals, window = trajectory.totals, TimeWindow(path.first, path.last + 1)
+    window = TimeWindow(path.first, path.last + 1)
     is_in_map = set(path.frames) == {view.limits.map_frame}
-    if not totals.gaps or is_in_map or is_one_run(view, topic, [window]):
+    if not trajectory.totals.gaps or is_in_map or is_one_run(view, topic, [window]):
         return trajectory
-    return replace(trajectory, totals=replace(totals, are_gaps_between_runs=True))
+    return replace(trajectory, are_gaps_between_runs=True)
 
 
 def axes_of(frame_id: str) -> tuple[str, ...]:

@@ -196,7 +196,7 @@ class FarthestPose:
     LOCAL("local", "start", "end"),
     PLAIN("poses", "trajectory.poses"),
     digits(4)("path_sum_m", "trajectory.totals.path_sum_m").when("trajectory.is_noisy"),
-    digits(4)("gap_m", "trajectory.totals.known_gap_m").if_known,
+    digits(4)("gap_m", "trajectory.gap_m").if_known,
     OBJECT("farthest").if_known,
     span=("start", "end"),
 )

@@ -298,7 +298,6 @@ class MotionTotals:
         jumped_m: the length of these steps.
         gaps: how many times nothing was recorded.
         gap_m: the distance across gaps, in straight lines.
-        are_gaps_between_runs: whether odometry may have begun anew in a gap: `gap_m` is unknown.
         gap_ns: how long gaps last, and other steps of more than a second that are left out.
         resets: log times of the first pose after each reset, of at most `_MAX_RESETS`.
         speed_mps: the highest measured speed; None if there are too few poses.
@@ -312,7 +311,6 @@ class MotionTotals:
     jumped_m: float = 0.0
     gaps: int = 0
     gap_m: float = 0.0
-    are_gaps_between_runs: bool = False
     gap_ns: Ns = 0
     resets: tuple[Ns, ...] = ()
     speed_mps: float | None = None
@@ -321,11 +319,6 @@ class MotionTotals:
     def newest(self) -> Leg | None:
         """The last leg, which may be the first one."""
         return self.tail or self.head
-
-    @property
-    def known_gap_m(self) -> float | None:
-        """The distance across gaps; None without a gap, or if it is unknown."""
-        return self.gap_m if self.gaps and not self.are_gaps_between_runs else None
 
     @property
     def distance_m(self) -> float:

@@ -95,6 +95,7 @@ class Trajectory:
         waypoint_error_m: no pose is farther than this from the drawn path.
         poses: how many poses are valid.
         invalid: how many are not: a coordinate is NaN, infinite or beyond any place.
+        are_gaps_between_runs: whether odometry may have begun anew in a gap.
     """
 
     totals: MotionTotals
@@ -105,6 +106,12 @@ class Trajectory:
     waypoint_error_m: float
     poses: int
     invalid: int
+    are_gaps_between_runs: bool = False
+
+    @property
+    def gap_m(self) -> float | None:
+        """The distance (m) across gaps, in straight lines; None without a gap, or if unknown."""
+        return self.totals.gap_m if self.totals.gaps and not self.are_gaps_between_runs else None
 
     @property
     def is_known(self) -> bool:
