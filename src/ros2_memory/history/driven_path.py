@@ -579,6 +579,12 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
     return poses.rows(np.flatnonzero(placed.valid))
 
 
+def sparse_poses_of_body(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+    """Returns the poses of `poses_by_session`, at most twenty a second."""
+    poses = poses_by_session(view, window, session, body)
+    return poses.rows(_positions_apart(poses.times))
+
+
 def _positions_apart(times: IntArray) -> IntArray:
     """Returns the positions of ascending times (ns) that are at least `_STEP_NS` apart."""
     last, positions = MIN_NS, list[int]()

@@ -41,6 +41,11 @@ from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.detections import DetectionRows
+from ros2_memory.history.driven_path import (
+    body_by_transforms,
+    resolve_path_topic,
+    sparse_poses_of_body,
+)
 from ros2_memory.history.poses import poses_by_bag
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
@@ -137,6 +142,10 @@ class RowMaker:
     def __post_init__(self) -> None:
         """Opens a view of the memory as it is now."""
         self._view = View(self.memory, Call())
+        self._body = body_by_transforms(self._view)
+        self._path_topic = self._view.pose_topic
+        if self._body is not None:
+            self._path_topic = resolve_path_topic(self._view)
         self._sight_reader = SightReader(self._view)
         self._detections = DetectionRows(self._view)
         self._thing = cache(Labels(self.memory.limits.labels).key)
@@ -156,7 +165,7 @@ class RowMaker:
         statics = repr(static_at(sessions.static(recordings), bag.end))
         of_labels = self.memory.limits.labels.items()
         labels = {name: sorted(variants) for name, variants in of_labels}
-        settings = ROWS_VERSION, self.config, self._view.pose_topic, labels
+        settings = ROWS_VERSION, self.config, self._path_topic, labels
         joined = self.memory.index.joined_with(bag.recording)
         return _digest([*settings, statics, sorted(self.whole), counted, *joined])
 
@@ -178,7 +187,6 @@ class RowMaker:
         """Reads the poses, events, things and detections of all bags at once."""
         window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
         files = {bag.file for bag in bags}
-        pose_rows = scan(self._view, self._view.pose_topic, window, copies=True)
         events, files_by_topic = self._events(window, files)
         things: dict[BagFile, list[Row]] = defaultdict(list)
         for bag, frame, sights in self._sight_reader.sights_by_bag([*bags]):
@@ -188,8 +196,20 @@ class RowMaker:
             for rows_of_bags in scan(self._view, topic, window, copies=True):
                 for bag, positions in rows_of_bags.bag_rows(among):
                     detections[bag][topic].append(rows_of_bags.some(positions))
-        poses = poses_by_bag(self._view, pose_rows, files)
-        return _Derived(window, poses, events, things, detections)
+        return _Derived(window, self._poses_by_file(bags, window), events, things, detections)
+
+    def _poses_by_file(self, bags: Collection[BagFile], window: TimeWindow) -> Mapping[str, Poses]:
+        """Returns the robot's poses in each bag, by transforms where no topic has poses."""
+        view, body = self._view, self._body
+        if body is None:
+            rows = scan(view, self._path_topic, window, copies=True)
+            return poses_by_bag(view, rows, {bag.file for bag in bags})
+        poses = {}
+        for bag in bags:
+            session = view.sessions.session_of(bag.recording)
+            of_bag = TimeWindow(bag.start, bag.end + 1)
+            poses[bag.file] = sparse_poses_of_body(view, of_bag, session, body)
+        return {file: of_bag for file, of_bag in poses.items() if len(of_bag)}
 
     def _rows_of_bag(
         self, bag: BagFile, shipped: ShippedBag, derived: _Derived
@@ -205,7 +225,7 @@ class RowMaker:
             "messages": bag.summary.count,
             "undecodable": undecodable,
             "detections": len(sightings),
-            "pose_topic": self._view.pose_topic,
+            "pose_topic": self._path_topic,
             "map_frame": map_frame,
             **driven,
             "summary": bag.summary.schema.to_json(),
@@ -245,7 +265,7 @@ class RowMaker:
         return tracks
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
-        same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
+        same = {"topic": self._path_topic, "frame_id": frame, "error_m": TOLERANCE_M}
         # A track counts whole turns; here headings are from -pi to pi.
         wrapped = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
         heading = wrapped.round(_ANGLE_DIGITS)
@@ -274,7 +294,7 @@ class RowMaker:
 
     def _driven(self, poses: Poses | None) -> tuple[Row, list[Row]]:
         """Returns columns of `bags` that follow from poses, and standstills and drops as events."""
-        topic = self._view.pose_topic
+        topic = self._path_topic
         if poses is None:
             return {}, []
         fastest_mps = self.memory.limits.max_plausible_speed_mps

@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.tables import NAMESPACE, TABLES, bags_condition, open_tables
 from ros2_memory.lake.warehouse import LakeFile, LakeLocation
-from tests.support.bags import Msg, battery, detections, odom, text, write_mcap
+from tests.support.bags import Msg, battery, detections, odom, text, tf, transform, write_mcap
 from tests.support.fleets import NOW, START_S
 from tests.support.lakes import lake_in, lake_rows, robot_bags, ship
 from tests.support.memories import memory_of
@@ -150,6 +150,22 @@ def test_a_pose_that_cannot_be_decoded_costs_its_bag_alone_the_poses(
     assert [(row["poses"], row["distance_m"]) for row in rows] == [
         (None, None) if nth == spoiled else (20, 9.5) for nth in range(4)
     ]
+
+
+def test_the_metres_of_a_robot_that_transforms_alone_place_are_in_the_lake(tmp_path: Path) -> None:
+    """An arm goes 1.2 m along its rail and stands for 14 s, in each of two bags."""
+    begin, bags = START_S * NS_PER_S, tmp_path / "bags"
+    for nth in range(2):
+        moves = [begin + (20 * nth * 10 + n) * NS_PER_S // 10 for n in range(200)]
+        rail = [(at, min(n, 60) * 0.02) for n, at in enumerate(moves)]
+        moved = [tf(at, transform(at, "world", "base_link", (x, 0.0, 0.0))) for at, x in rail]
+        write_mcap(bags / f"rec{nth}" / f"rec{nth}_0.mcap", moved)
+    assert ship(tmp_path / "lake", [robot_bags("arm", bags)]).bags == 2
+    for row in lake_rows(tmp_path / "lake", "bags"):
+        assert (row["pose_topic"], row["poses"]) == ("/tf", 200)
+        assert row["distance_m"] == pytest.approx(1.2, abs=0.02)
+        assert row["stood_s"] == pytest.approx(13.9, abs=0.5)
+    assert {row["topic"] for row in lake_rows(tmp_path / "lake", "poses")} == {"/tf"}
 
 
 @pytest.mark.parametrize("earlier_s", [0, 1200])
