@@ -373,7 +373,7 @@ def no_data_at(
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
         *_distances(at, older, newer, tolerance),
         *why,
-        *_advice(view, reason, at),
+        *_advice(view, reason, at, topics),
     ]
     is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
     holds_on = older and tolerance is not None and _may_hold_on(view, older, at)
@@ -451,7 +451,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         reason = reason_beyond(view, min(end, max(start, view.memory.clock.now())))
     if _are_cut(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
-    detail += _advice(view, reason, start)
+    detail += _advice(view, reason, start, topics)
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -582,12 +582,29 @@ def _active_answers(view: View) -> bool:
     return all(aside.answers for aside in view.snapshot.active)
 
 
-def _advice(view: View, reason: NoDataReason, at: Ns) -> Iterator[str]:
-    """Yields sentences on what to ask instead of a moment."""
+def _are_unlisted(view: View, topics: Sequence[str]) -> bool:
+    """Whether a recorder runs whose list has none of the topics, or excludes those it has."""
+    heartbeat = view.memory.heartbeat()
+    if heartbeat is None or not heartbeat.is_live(view.memory.clock.now()):
+        return False
+    taken, excluded = set[str](), set[str]()
+    for line in heartbeat.listed:
+        excludes, name = line.startswith("not "), line.removeprefix("not ")
+        (excluded if excludes else taken).update(match_topics(topics, name))
+    return bool(heartbeat.listed) and taken <= excluded
+
+
+def _advice(view: View, reason: NoDataReason, at: Ns, topics: Sequence[str] = ()) -> Iterator[str]:
+    """Yields sentences on what to ask instead of a moment: of topics, or of all."""
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is not None and latest is not None:
         yield f"the memory covers {unix_text(earliest)} to {unix_text(latest)}"
-    if reason is NoDataReason.NOT_CLOSED_YET and _active_answers(view):
+    if reason is NoDataReason.NOT_CLOSED_YET and topics and _are_unlisted(view, topics):
+        yield (
+            f"the recorder no longer records {listed(topics)} (recording.topics_file): ask about "
+            "an earlier moment"
+        )
+    elif reason is NoDataReason.NOT_CLOSED_YET and _active_answers(view):
         yield f"ask about an earlier moment, or again in {ON_DISK_S} s"
     elif reason is NoDataReason.NOT_CLOSED_YET:
         yield (

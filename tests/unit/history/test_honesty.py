@@ -51,6 +51,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import FixedClock, SettableClock
+from tests.support.heartbeats import beat
 from tests.support.listed_bags import odom_bag
 from tests.support.mcap_surgery import chunks_of, spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, replied, with_store
@@ -513,6 +514,32 @@ def test_a_window_that_is_recorded_in_part_says_how_much(memory: Memory, tool: s
     assert "recorded" not in str(whole.get("notes"))
     almost = asked(memory, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39.01)
     assert "recorded only" not in str(almost.get("notes"))
+
+
+@pytest.mark.parametrize(
+    ("listed", "waits"),
+    [
+        (("/tf", "/scan"), False),
+        (("/*", "not /odom"), False),
+        (("/tf", "/od*"), True),
+        ((), True),
+    ],
+)
+def test_a_topic_that_the_recorder_no_longer_records_is_not_waited_for(
+    tmp_path: Path, listed: tuple[str, ...], waits: bool
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages(0))
+    active = write_mcap(tmp_path / "rec" / "rec_1.mcap", messages(20), McapLayout(finish=False))
+    os.utime(active, ns=(T0 + 29 * S,) * 2)
+    beat(tmp_path, T0 + 30 * S, listed=listed, recordings=("rec",))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
+    for reply in (
+        asked(memory, "get_position_seconds_ago", seconds_ago=1),
+        asked(memory, "get_topic_in_last", topic="/odom", seconds=2),
+    ):
+        assert reply["reason"] == "not_closed_yet"
+        assert ("or again in" in reply["detail"]) is waits
+        assert ("the recorder no longer records /odom" in reply["detail"]) is not waits
 
 
 BEGIN = 1_784_000_000
