@@ -386,7 +386,7 @@ def robot_body(view: View) -> Body | None:
     map_frame = view.limits.map_frame
     body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
-    odometry = next(filter(_is_odometry, above[body]), root)
+    odometry = next(filter(is_odometry, above[body]), root)
     others = sorted({child for child in moving if child != body})
     beside = tuple(
         child
@@ -407,14 +407,15 @@ def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
     return frames
 
 
-def _is_odometry(frame: str) -> bool:
+def is_odometry(frame: str) -> bool:
+    """Whether a frame is one of odometry, by its name."""
     return frame.rpartition("/")[2].startswith("odom")
 
 
 def _body_rank(frame: str, map_frame: str | None) -> int:
     """Returns how unlikely a frame is the body: named bodies first, frames of the world last."""
     name = frame.rpartition("/")[2]
-    if name == map_frame or _is_odometry(frame):
+    if name == map_frame or is_odometry(frame):
         return len(_BODIES) + 1  # it moves only as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 

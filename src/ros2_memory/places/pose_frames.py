@@ -38,6 +38,7 @@ from ros2_memory.history.driven_path import (
     body_by_transforms,
     body_of,
     frame_of_newest_pose,
+    is_odometry,
     newest_of_body,
     resolve_path_topic,
 )
@@ -356,7 +357,9 @@ def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
 
 def changing_origin(frame_id: str) -> str:
     """Returns the reason, for notes, why coordinates of several runs cannot be compared."""
-    return f"the origin of {frame_id or 'their frame'} changes with every start"
+    if not frame_id or is_odometry(frame_id):
+        return f"the origin of {frame_id or 'their frame'} changes with every start"
+    return f"the origin of {frame_id} may change with every start, unless data.map_frame names it"
 
 
 def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None:

@@ -383,3 +383,24 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         [found] = asked(memory, "find_matches", where=name, **hello)["sightings"]
         assert (found["first_seen"] - T0, found["count"]) == (first, 30)
         assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
+
+
+@pytest.mark.parametrize("map_frame", ["map", "world"])
+def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
+    tmp_path: Path, map_frame: str
+) -> None:
+    """It goes along its rail in two recordings; only transforms place it, in `world`."""
+    for nth in range(2):
+        times = [BEGIN + (1000 * nth + n) * S // 10 for n in range(100)]
+        moved = [
+            tf(at, transform(at, "world", "base_link", (n / 50, 0.0, 0.0)))
+            for n, at in enumerate(times)
+        ]
+        write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", moved)
+    memory = memory_of(tmp_path, limits=QuerySettings(map_frame=map_frame))
+    reply = asked(memory, "visits", x=1.0, y=0.0, radius_m=0.2)
+    assert (reply["frame_id"], reply["total"]) == ("world", 2)
+    notes = str(reply["notes"])
+    asked_for = "the origin of world may change with every start, unless data.map_frame names it"
+    assert (asked_for in notes) == (map_frame == "map")
+    assert "changes with every start" not in notes
