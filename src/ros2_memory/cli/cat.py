@@ -7,9 +7,9 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import Bags, Times
 from ros2_memory.cli.output import (
-    csv_line,
     format_time,
     format_value,
     leaves,

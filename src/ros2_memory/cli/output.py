@@ -5,12 +5,10 @@ Recorded text may contain control characters, which must never reach a terminal:
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import sys
 from contextlib import contextmanager, suppress
-from io import StringIO
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +20,6 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.text import dotted
 from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
-from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -58,19 +55,6 @@ def print_exactly(lines: Iterable[str]) -> int:
         print(escape(line) if is_terminal else line)
     sys.stdout.flush()
     return count
-
-
-def csv_line(cells: Iterable[JsonValue]) -> str:
-    """Returns a row of CSV, without the line's end: texts as they are, all else as JSON."""
-    line = StringIO()
-    csv.writer(line, lineterminator="").writerow(map(_csv_cell, cells))
-    return line.getvalue()
-
-
-def _csv_cell(value: JsonValue) -> str | None:
-    if isinstance(value, str | None):
-        return value
-    return to_json_text(value) if isinstance(value, list | dict) else json.dumps(value)
 
 
 @contextmanager

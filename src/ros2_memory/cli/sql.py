@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from ros2_memory.bootstrap_fleet import open_lake
+from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import AsJson, Overrides, load_for
-from ros2_memory.cli.output import csv_line, print_exactly, print_line, print_reply
+from ros2_memory.cli.output import print_exactly, print_line, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.tools.reply_size import to_json_text
