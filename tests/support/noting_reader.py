@@ -17,11 +17,15 @@ class NotingReader(McapReader):
 
     Attributes:
         asked: a bag and the topics of messages; none for a summary or its channels.
+        windows: the window of each search for messages.
+        read: the topic of each message that was read.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.asked: list[tuple[Path, tuple[str, ...]]] = []
+        self.windows: list[TimeWindow] = []
+        self.read: list[str] = []
 
     @property
     def names(self) -> list[str]:
@@ -45,7 +49,10 @@ class NotingReader(McapReader):
         newest_first: bool = False,
     ) -> Iterator[Record]:
         self.asked.append((path, tuple(topics)))
-        return super().records(path, topics, window, newest_first=newest_first)
+        self.windows.append(window)
+        for record in super().records(path, topics, window, newest_first=newest_first):
+            self.read.append(record.channel.topic)
+            yield record
 
 
 def fail_reading(

@@ -670,13 +670,14 @@ def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
 
 
 def is_missed(snapshot: Snapshot, window: TimeWindow, start: Ns, end: Ns) -> bool:
-    """Whether a window misses something by a gap: more than an ordinary pause, or all it has.
+    """Returns whether a gap takes more of a window than an ordinary pause, or than a tenth of it.
 
-    Whoever asks about a whole hour is not told of the gap that begins with its last message.
+    A window of an hour has no note on the gap that begins with its last message.
     """
     first, last = window.asked()
     begin, stop = max(start, first), min(end, last)
-    return stop - begin > snapshot.shortest_gap or (begin, stop) == (first, last)
+    least = min(snapshot.shortest_gap, (last - first) // 10)
+    return stop - begin > least or (begin, stop) == (first, last)
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:

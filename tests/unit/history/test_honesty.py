@@ -590,7 +590,8 @@ def test_a_cause_is_said_of_the_interruption_and_not_of_the_whole_gap(apart: Pat
 
 
 @pytest.mark.parametrize(
-    ("start", "end", "is_told"), [(99.99, 110, False), (0, 20.01, False), (95, 110, True)]
+    ("start", "end", "is_told"),
+    [(99.99, 110, False), (0, 20.01, False), (95, 110, True), (99.5, 103, True)],
 )
 def test_a_gap_that_only_touches_a_window_is_no_gap_of_it(
     apart: Path, start: float, end: float, is_told: bool

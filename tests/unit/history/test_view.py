@@ -2,7 +2,7 @@
 
 import os
 import random
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +18,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
-from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -33,6 +32,7 @@ from tests.support.bags import (
 from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.noting_reader import NotingReader
 from tests.support.random_histories import S
 
 T0: Final = 1_700_006_400 * S
@@ -201,22 +201,9 @@ def test_the_newest_message_of_a_silent_topic_is_read_without_the_time_after_it(
         tmp_path / "rec" / "rec_0.mcap", [*bumps, *(odom(T0 + at * S, at) for at in range(100))]
     )
     write_mcap(tmp_path / "later" / "later_0.mcap", [odom(T0 + 200 * S, 200.0)])
-    windows: list[TimeWindow] = []
-
-    class Noting(McapReader):
-        def records(
-            self,
-            path: Path,
-            topics: Collection[str],
-            window: TimeWindow,
-            *,
-            newest_first: bool = False,
-        ) -> Iterator[Record]:
-            windows.append(window)
-            return super().records(path, topics, window, newest_first=newest_first)
-
-    view = View(memory_of(tmp_path, reader=Noting()), Call())
+    reader = NotingReader()
+    view = View(memory_of(tmp_path, reader=reader), Call())
     newest = view.stream.last("/bumper", T0 + 90 * S)
     assert newest is not None
     assert newest.time == T0 + 1
-    assert max(window.stop for window in windows) == T0 + 2
+    assert max(window.stop for window in reader.windows) == T0 + 2

@@ -4,7 +4,6 @@ What is expected is counted from the drawn world itself, second by second.
 """
 
 import math
-from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -17,15 +16,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from ros2_memory.storage.base import Record
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
@@ -189,27 +185,13 @@ def test_a_while_is_answered_from_the_store_and_reads_few_messages(tmp_path: Pat
     write_mcap(
         tmp_path / "rec" / "rec_0.mcap", sorted([*flags, *hellos], key=attrgetter("log_time"))
     )
-    read: list[str] = []
-
-    class Counting(McapReader):
-        def records(
-            self,
-            path: Path,
-            topics: Collection[str],
-            window: TimeWindow,
-            *,
-            newest_first: bool = False,
-        ) -> Iterator[Record]:
-            for record in super().records(path, topics, window, newest_first=newest_first):
-                read.append(record.channel.topic)
-                yield record
-
-    memory = memory_of(tmp_path, reader=Counting(), recalls=True)
+    reader = NotingReader()
+    memory = memory_of(tmp_path, reader=reader, recalls=True)
     during = {"topic": "/bumper", "condition_type": "equals", "value": True}
-    read.clear()
+    reader.read.clear()
     reply = asked(memory, "find_matches", by="hour", **HELLO, **{"while": during})
     assert reply["all"][reply["columns"].index("count") - 1] == 5
-    assert read.count("/bumper") < 10
+    assert reader.read.count("/bumper") < 10
 
 
 def test_what_a_rare_topic_said_last_is_looked_up_once_for_all_matches(tmp_path: Path) -> None:
