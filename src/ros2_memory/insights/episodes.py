@@ -2,7 +2,7 @@
 
 A topic of plain texts (`std_msgs/msg/String`) says episodes if one of its newest values is an empty
 text, which ends the episode before. An episode belongs to a window if it held in it, and to a scope
-if the scope held when it began.
+with the parts of its time in that.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.timebase import Span
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.where import Scope
 
@@ -136,12 +137,23 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
             waiting = None
         if held is None or (held.stop <= start and held.start < scope.window.start):
             return
-        if condition.matches({"value": held.exact}) and scope.holds_at(held.start):
+        parts = _parts_of(held, scope) if condition.matches({"value": held.exact}) else ()
+        if parts:
             # What no message ended may stop with its own last one.
             following = newer or values.named_after(held.stop + (not held.ended))
             after = None if following is None else spell_of(following)
-            waiting = Episode(spell_of(held), None, after)
+            waiting = Episode(spell_of(held), parts, None, after)
         newer = held
+
+
+def _parts_of(held: HeldValue, scope: Scope) -> Sequence[Span]:
+    """Returns the parts of the time of a value that lie in a scope; their ends are inclusive."""
+    if not scope.is_bounded:
+        return [(held.start, held.stop)]
+    start, end = scope.window.asked()
+    parts = scope.parts_of(max(held.start, start), min(held.stop, end))
+    # At the moment at which another value begins this one does not hold.
+    return [(first, last) for first, last in parts if first < last or first == held.start]
 
 
 def spell_of(held: HeldValue) -> Spell:

@@ -198,10 +198,13 @@ def _select_rows(
 
 
 def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -> Row:
-    """Returns a row with how much of its time the clock skipped, and what was said meanwhile."""
+    """Returns a row with how much of its time does not count, and what was said meanwhile."""
+    skipped = elapsed.skipped_between(row.first, row.until)
+    if isinstance(row, Episode):
+        skipped = row.until - row.first - elapsed.among(row.parts)
     return replace(
         row,
-        skipped=elapsed.skipped_between(row.first, row.until),
+        skipped=skipped,
         said=None if other is None else other.during(row.first, row.until),
     )
 
@@ -332,7 +335,9 @@ def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope)
         start = scope.window.start
         return SightingSpans(
             held_spans(
-                (episode.first, episode.until, episode.first >= start) for episode in found.episodes
+                (first, last, first == episode.first and episode.spell.first >= start)
+                for episode in found.episodes
+                for first, last in episode.parts
             ),
             found.since,
             f"more than {MOST_COUNTED:,} episodes" if is_full else "",

@@ -34,7 +34,10 @@ from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.core.model import JsonValue, Pose
+    from ros2_memory.core.timebase import Span
 
 
 MOST_SAID: Final = 30
@@ -78,13 +81,14 @@ SAID: Final = OBJECTS("with", "said").if_known.first(MOST_SAID)
 
 
 @result(
-    TIME("start", "spell.first"),
-    TIME("end", "spell.until"),
-    LOCAL("local", "spell.first", "spell.until"),
-    LASTED("seconds", "spell.first", "spell.until", "skipped"),
-    AGO("ago_s", "spell.until"),
+    TIME("start", "first"),
+    TIME("end", "until"),
+    LOCAL("local", "first", "until"),
+    LASTED("seconds", "first", "until", "skipped"),
+    AGO("ago_s", "until"),
     MESSAGE("value", "spell.value"),
-    PLAIN("ended", "spell.ended").when("spell.goes_on"),
+    PLAIN("began_earlier").if_any,
+    PLAIN("ended").when("goes_on"),
     an_object(keys(POSE("robot"), NAME("frame_id", "robot.frame_id")))(
         "robot", itself_if("robot")
     ).if_known,
@@ -97,14 +101,17 @@ class Episode:
 
     Attributes:
         spell: the text, and when it held.
+        parts: the first and the last log time of each part of that time in the place that was
+            asked about, or while what was asked for held, in order; all of it without these.
         previous: the text before; None if there is none, or if time ran out before it was found.
         following: the text after; None as for `previous`.
         robot: its pose when the text began; None if it is not known.
         said: values of another topic meanwhile; None if they were not asked for.
-        skipped: how much of the time the clock skipped.
+        skipped: how much of the time from `first` to `until` the clock skipped, or is in no part.
     """
 
     spell: Spell
+    parts: Sequence[Span]
     previous: Spell | None
     following: Spell | None
     robot: Pose | None = None
@@ -113,13 +120,30 @@ class Episode:
 
     @property
     def first(self) -> Ns:
-        """When it began."""
-        return self.spell.first
+        """When it began, or was first known in a part."""
+        first, _ = self.parts[0]
+        return first
 
     @property
     def until(self) -> Ns:
-        """Until when it held."""
-        return self.spell.until
+        """Until when it held in the last part."""
+        _, until = self.parts[-1]
+        return until
+
+    @property
+    def began_earlier(self) -> bool:
+        """Whether it began before its first part."""
+        return self.first > self.spell.first
+
+    @property
+    def ended(self) -> bool:
+        """Whether a message ended it at `until`."""
+        return self.spell.ended and self.until == self.spell.until
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether no message ended it at `until`."""
+        return not self.ended
 
 
 def _first_change(answer: Changes) -> Ns | None:

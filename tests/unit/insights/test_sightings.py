@@ -418,6 +418,45 @@ def test_the_last_text_of_all_is_found_from_its_own_time_on_and_follows_itself_n
         assert [row["value"] for row in changes["changes"]][-1] == "dock"
 
 
+@each_way
+def test_an_episode_that_began_elsewhere_counts_for_its_time_in_the_place(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The robot is beyond x = 5 m from 50 to 149 s and from 249 s on, at 0.1 m/s."""
+    x = [*range(100), *range(99, 49, -1), *range(49, 0, -1), *range(1, 101)]
+    drive = [odom(BEGIN + at * S, of / 10) for at, of in enumerate(x)]
+    words = {10: "mow", 60: "rake", 80: "mow", 170: "", 230: "mow", 280: "", 290: "fetch"}
+    said = [text(BEGIN + at * S, word, "/task") for at, word in words.items()]
+    docked = [boolean(BEGIN + at * S, at < 20, "/docked") for at in range(0, 299, 2)]
+    memory = remembered(tmp_path, [*drive, *said, *docked], recalls=recalls)
+    place = {"x": [5.0, 20.0], "y": [-1.0, 1.0]}
+    mown = {"topic": "/task", "condition_type": "equals", "value": "mow"}
+
+    def found(**bounds: object) -> list[tuple[int, int, int, bool]]:
+        keys = ("start", "end", "seconds")
+        return [
+            (*(round(row[key] - T0 * (key != "seconds")) for key in keys), "began_earlier" in row)
+            for row in asked(memory, "find_matches", **mown, **bounds)["episodes"]
+        ]
+
+    def counted(**bounds: object) -> tuple[int, int]:
+        whole = table(asked(memory, "find_matches", **mown, by="hour", **bounds))["all"]
+        return whole["count"], round(whole["seconds"])
+
+    assert found() == [(230, 280, 50, False), (80, 170, 90, False), (10, 60, 50, False)]
+    inside = [(248, 280, 32, True), (80, 149, 69, False), (50, 60, 10, True)]
+    assert found(where=place) == inside
+    assert counted(where=place) == (3, 111)
+    undocked = {"topic": "/docked", "condition_type": "equals", "value": False}
+    assert found(**{"while": undocked})[-1] == (20, 60, 40, True)
+    assert counted(**{"while": undocked}) == (3, 180)
+    window = {"start": T0 + 100, "end": T0 + 260}
+    assert found(where=place, **window) == [(248, 260, 12, True), (100, 149, 49, True)]
+    assert counted(where=place, **window) == (1, 61)
+    [row, *_] = asked(memory, "find_matches", **mown, where=place)["episodes"]
+    assert (row["robot"]["x"], row["previous"]["value"]) == (pytest.approx(5.0, abs=0.1), "mow")
+
+
 def test_of_more_episodes_than_are_counted_the_newest_are(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
