@@ -1,15 +1,16 @@
 """Episodes: what a robot did, as texts that hold until the next text.
 
 A topic of plain texts (`std_msgs/msg/String`) says episodes if one of its newest values is an empty
-text, which ends the episode before. An episode belongs to a window if it held in it, and to a scope
+text, which ends the episode before, or if it is rare and its texts name states. An episode belongs to a window if it held in it, and to a scope
 with the parts of its time in that.
 """
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from dataclasses import replace
-from itertools import islice, takewhile
+from itertools import groupby, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -17,7 +18,7 @@ from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
-from ros2_memory.history.held_values import HeldValue, HeldValues, is_text
+from ros2_memory.history.held_values import HeldValue, HeldValues, holds_on, is_latched, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
@@ -37,6 +38,8 @@ _MOST_LOOKED_AT: Final = 50
 """The newest values of a topic that are looked at for an empty text."""
 _LONGEST_STATE: Final = 10_000
 """A longer text (characters) does not say what a robot does."""
+_CONSTANT: Final = re.compile(r"(?=.*[A-Z])[A-Z0-9_.:/ -]+")
+_NAME: Final = re.compile(r"[^\W\d][\w.:/-]*")
 _LONGEST_TEXT: Final = 200
 MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
@@ -57,7 +60,7 @@ class FoundEpisodes(NamedTuple):
 
 
 def says_episodes(view: View, topics: Sequence[str]) -> bool:
-    """Returns whether topics are one topic of texts that an empty text ends.
+    """Returns whether topics are one topic of texts that hold until the next one.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -66,9 +69,14 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
         return False
     # A view of its own: its notes are of values that may lie outside of the window.
     values = HeldValues(View(view.memory, view.call, view.reach), topics[0])
-    newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
+    texts: list[str] = []
     try:
-        return any(held.is_blank for held in islice(newest, _MOST_LOOKED_AT))
+        for held in islice(values.back(MAX_NS), _MOST_LOOKED_AT):
+            if held.is_blank:
+                return True
+            if len(held.word) > _LONGEST_STATE:
+                return False
+            texts.append(str(held.exact))
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
@@ -78,6 +86,20 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
             "each message counts alone, and may have held for longer than duration_s"
         )
         return False
+    # What a latched topic said holds in sightings, too, and a frequent topic repeats its state.
+    is_on_change = holds_on(view, topics) and not is_latched(view, topics[0])
+    return is_on_change and _name_states(texts)
+
+
+def _name_states(texts: Sequence[str]) -> bool:
+    """Returns whether texts name states: constants such as IDLE, or a few words that come again.
+
+    What people say seldom does.
+    """
+    if all(map(_CONSTANT.fullmatch, texts)):
+        return bool(texts)
+    changes = [text for text, _ in groupby(texts)]
+    return all(map(_NAME.fullmatch, texts)) and len(changes) >= 2 * len({*changes})
 
 
 def find_episodes(

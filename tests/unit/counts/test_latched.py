@@ -200,13 +200,13 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
         messages = [odom(T0 + (begin + at) * S, 0.0) for at in range(0, 1001, 2)]
         write_splits(tmp_path, [*states, *messages], 10, f"run{begin}")
     given = {"topic": "/mission", "condition_type": "equals", "value": "CHARGING", "by": "day"}
-    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
-    assert table(reply)["all"]["topic_s"] == pytest.approx(2 * 990, abs=1)
-    note = "a text on /mission counts for the moment in which it was said"
-    assert any(sentence.startswith(note) for sentence in reply["notes"])
+    memory = memory_of(tmp_path, recalls=recalls)
+    whole = table(asked(memory, "find_matches", **given))["all"]
+    assert (whole["count"], whole["seconds"]) == (4, 2 * 690)
+    assert whole["topic_s"] == pytest.approx(2 * 990, abs=1)
     del given["by"]
-    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", **given)
-    assert any(sentence.startswith(note) for sentence in reply["notes"])
+    episodes = asked(memory, "find_matches", **given)["episodes"]
+    assert [row["seconds"] for row in episodes] == [300, 390, 300, 390]
 
 
 @each_way

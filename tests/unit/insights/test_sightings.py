@@ -457,6 +457,42 @@ def test_an_episode_that_began_elsewhere_counts_for_its_time_in_the_place(
     assert (row["robot"]["x"], row["previous"]["value"]) == (pytest.approx(5.0, abs=0.1), "mow")
 
 
+@each_way
+@pytest.mark.parametrize(
+    ("words", "are_states"),
+    [
+        (("IDLE", "DOCKING", "IDLE"), True),
+        (("NAV TO GOAL", "E-STOP", "IDLE"), True),
+        (("idle", "docking", "idle", "docking"), True),
+        (("idle", "docking", "idle"), False),
+        (("stop", "stop", "stop"), False),
+        (("Bring me the cup", "thanks", "Bring me the cup", "thanks"), False),
+        (("IDLE", "12"), False),
+    ],
+)
+def test_a_state_without_an_empty_text_holds_until_the_next_one(
+    tmp_path: Path, words: Sequence[str], are_states: bool, recalls: bool
+) -> None:
+    """A word every 60 s, and the robot's pose until 300 s."""
+    said = [text(BEGIN + (60 * nth + 5) * S, word, "/mode") for nth, word in enumerate(words)]
+    drive = [odom(BEGIN + at * S, at / 10) for at in range(301)]
+    memory = remembered(tmp_path, [*said, *drive], recalls=recalls)
+    given = {"topic": "/mode", "condition_type": "equals", "value": words[0]}
+    reply = asked(memory, "find_matches", **given)
+    counted = table(asked(memory, "find_matches", **given, by="hour"))["all"]
+    starts = [60 * nth + 5 for nth, word in enumerate(words) if word == words[0]]
+    assert counted["count"] == len(starts)
+    if not are_states:
+        assert [row["duration_s"] for row in reply["sightings"]] == [0.0] * len(starts)
+        assert "a text on /mode counts for the moment" in reply["notes"][0]
+        return
+    last = 60 * len(words) - 55
+    lengths = [(60.0, True) if at < last else (300.0 - last, False) for at in starts[::-1]]
+    found = [(row["seconds"], row.get("ended", True)) for row in reply["episodes"]]
+    assert found == lengths
+    assert counted["seconds"] == sum(seconds for seconds, _ in lengths)
+
+
 def test_of_more_episodes_than_are_counted_the_newest_are(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
