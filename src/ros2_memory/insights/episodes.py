@@ -1,8 +1,8 @@
 """Episodes: what a robot did, as texts that hold until the next text.
 
 A topic of plain texts (`std_msgs/msg/String`) says episodes if one of its newest values is an empty
-text, which ends the episode before, or if it is rare and its texts name states. An episode belongs to a window if it held in it, and to a scope
-with the parts of its time in that.
+text, which ends the episode before, or if it is rare and its texts name states. An episode belongs
+to a window if it held in it, and to a scope with the parts of its time in that.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from dataclasses import replace
 from heapq import nsmallest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.facts import FLAG, has_events
+from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
 from ros2_memory.analysis.intervals import IntervalTable, united_tables
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
@@ -74,6 +74,8 @@ _MOST_CHANGES: Final = 3
 """The nearest changes before an event that a recap lists."""
 _MOST_CHARS: Final = 1_200
 """Characters of all changes in a recap. With `around` it has all of them."""
+_LOW_CHARGE: Final = 0.1
+"""The fraction of a full battery below which a recap reports it, one of `LOW_CHARGES`."""
 _CHANGE_CHARS: Final = 30
 """Characters that the reply adds to a change's text."""
 
@@ -83,6 +85,7 @@ _PLURALS: Final = {
     "silence": "silences",
     "error": "errors",
     "failed goal": "failed goals",
+    "low battery": "low batteries",
     "stop": "stops",
     "flip": "on/off changes",
     "drop": "speed drops",
@@ -332,6 +335,7 @@ def _reported_events(
             events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])
         errors = _errors_in_region(view, topic, topic_events, region_stays)
         events += [_error_event(error) for error in errors]
+        events += _low_charge_events(view, topic, topic_events)
         note_limits(view, topic, topic_events)
     return events
 
@@ -514,6 +518,40 @@ def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> I
         text = toggle_sentence(topic, toggle)
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         next_toggle[toggle.name] = toggle.time
+
+
+def _low_charge_events(view: View, topic: str, events: TopicEvents) -> Iterator[Event]:
+    """Yields each time in which a battery was below `_LOW_CHARGE`, with how low it became.
+
+    A driver that does not know the charge may always say 0.
+    """
+    charges, changes = events.of_kind(CHARGE)
+    levels = [(state.at, state.first) for state in charges]
+    levels += [(change.time, change.value) for change in changes]
+    begins = {state.at for state in charges}
+    since, lowest = None, 0
+    for time, level in levels:
+        if level > LOW_CHARGES.index(_LOW_CHARGE):
+            since, lowest = time if since is None else since, max(level, lowest)
+        elif since is not None:
+            yield _low_charge_event(topic, since, time, lowest, is_begun=since not in begins)
+            since, lowest = None, 0
+    if since is None or (since in begins and _says_zero(view, topic, since)):
+        return
+    is_begun = since not in begins
+    event = _low_charge_event(topic, since, events.last, lowest, is_begun=is_begun)
+    yield replace(event, goes_on=True)
+
+
+def _low_charge_event(topic: str, start: Ns, end: Ns, lowest: int, *, is_begun: bool) -> Event:
+    verb = "fell" if is_begun else "was"
+    text = f"{topic} {verb} below {LOW_CHARGES[lowest - 1]:.0%}"
+    return Event("low battery", start, end, text)
+
+
+def _says_zero(view: View, topic: str, at: Ns) -> bool:
+    message = view.stream.last(topic, at + 1)
+    return message is not None and not charge_of(view.value(message))
 
 
 def _error_event(error: Report) -> Event:

@@ -46,9 +46,9 @@ _SIGHTINGS = ToolDeclaration(
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime, drawn=True),),
     "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
-    "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
-    "duration_s, text, in, score, before: changes 10 s before}}], counts}}. With "
-    "around: {{before: [{{text, s_before}}], after (5 s), looked_at, robot, state}}.",
+    "errors, low batteries, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: "
+    "[{{timestamp, ago_s, duration_s, text, in, score, before: changes 10 s before}}], counts}}. "
+    "With around: {{before: [{{text, s_before}}], after (5 s), looked_at, robot, state}}.",
     RecapArguments,
     recap_or_before,
     blocking=True,

@@ -57,6 +57,33 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     ) in over(remembered(tmp_path, many), 0, 10).notes
 
 
+@each_way
+@pytest.mark.parametrize("unit", [1.0, 100.0], ids=["fractions", "percent"])
+def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recalls: bool) -> None:
+    """From 25 to 3 % in 220 s, charged to 40 % at 300 s, at 8 % from 400 s on."""
+    charges = [*range(250, 30, -1), *([30] * 80), *([400] * 100), *([80] * 50)]
+    told = [battery(BEGIN + at * S, of * unit / 1000) for at, of in enumerate(charges)]
+    memory = remembered(tmp_path, told, recalls=recalls)
+
+    def events(first: int, last: int) -> list[tuple[str, float, float, bool]]:
+        return [
+            (event.text, since(event.start), since(event.end or 0), event.goes_on)
+            for event in over(memory, first, last).events
+        ]
+
+    fell, again = "/battery_state fell below 5%", "/battery_state fell below 10%"
+    assert events(0, 449) == [(fell, 151, 300, False), (again, 400, 449, True)]
+    assert events(0, 160) == [(again, 151, 160, True)]
+    assert events(240, 250) == [("/battery_state was below 5%", 240, 250, True)]
+    assert events(0, 140) == events(310, 390) == []
+    assert ("low batteries", 2) in over(memory, 0, 449).counts
+
+
+def test_a_battery_without_a_known_charge_is_not_low(tmp_path: Path) -> None:
+    told = [battery(BEGIN + at * S, 0.0) for at in range(60)]
+    assert over(remembered(tmp_path, told), 0, 59).events == ()
+
+
 def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) -> None:
     draw = Random(1)
     thrown = {5 * 50 + 25, 13 * 50 - 25}

@@ -2,11 +2,11 @@
 
 const ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
 const ONE = { gaps: "gap", "clock steps": "clock step", silences: "silence", errors: "error",
-  "failed goals": "failed goal", stops: "stop", "on/off changes": "on/off change", "speed drops": "speed drop",
+  "failed goals": "failed goal", "low batteries": "low battery", stops: "stop", "on/off changes": "on/off change", "speed drops": "speed drop",
   goals: "goal", sightings: "sighting" };
 const SOUND = "no loss or fault was found";
 const MISSED = "not_seen_where_expected";
-const PROBLEMS = ["error", "failed goal", "gap", "clock step", "silence"];
+const PROBLEMS = ["error", "failed goal", "low battery", "gap", "clock step", "silence"];
 const FEW = 2;  // of one kind of problem, of which more are bundled
 const LATEST = 4;
 

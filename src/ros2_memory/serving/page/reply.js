@@ -6,7 +6,8 @@
 
 const EVENTS = [["stop", /^stood at /], ["thing", / in view$/], ["silence", / (was|were) silent$/],
   ["gap", /^nothing (was recorded|is here)/], ["error", /^error: /], ["clock step", /^the clock was set/],
-  ["drop", /^slowed down suddenly/], ["failed goal", / goal (canceled|aborted)/], ["goal", / goal /]];
+  ["drop", /^slowed down suddenly/], ["failed goal", / goal (canceled|aborted)/], ["goal", / goal /],
+  ["low battery", / (fell|was) below \d+%$/]];
 const STOOD = /^stood at x (-?[\d.]+), y (-?[\d.]+)$/;
 const MISSING = "unknown";
 const SAME_PLACE_M = 0.2;

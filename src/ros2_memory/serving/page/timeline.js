@@ -13,7 +13,7 @@ const SPANS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10
 const MONTH_S = 2592000;
 /* What is drawn over what: a fault is seen among many that are none. */
 const WORST_LAST = ["accent", "good", "warn", "gap"];
-const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn",
+const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn", "low battery": "warn",
   silence: "warn", drop: "warn", flip: "accent", goal: "good" };
 
 const IN_VIEW = / in view$/;
@@ -80,7 +80,7 @@ class Timeline {
     const all = [{ name: "recorded", kind: "recorded", bars: of("silence") },
       { name: "stood", kind: "stood", bars: of("stop") }, ...seen,
       { name: "events", kind: "events",
-        bars: of("error", "failed goal", "goal", "flip", "drop", "clock step",
+        bars: of("error", "failed goal", "low battery", "goal", "flip", "drop", "clock step",
           ...(view.isReply ? ["gap", "silence"] : [])) },
       { name: "kept", kind: "kept", bars: view.moments.map((each) => ({ kind: "kept", t: each.start,
         end: each.end, text: `kept: ${each.label}` })) }];
