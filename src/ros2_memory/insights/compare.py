@@ -61,10 +61,16 @@ from ros2_memory.results import (
     StandstillPlace,
     ThingStay,
 )
-from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
+from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay, most_at_once
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
-from ros2_memory.things.unseen import describe_hung, note_undecoded, unplaced_notes, vague_notes
+from ros2_memory.things.unseen import (
+    describe_hung,
+    look_alike_notes,
+    note_undecoded,
+    unplaced_notes,
+    vague_notes,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -264,7 +270,9 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     windows = earlier, later
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, windows))
     places = places_asked(limits, where, things.frames)
-    return frame, _ThingsBetween(things, earlier, later, where, places).compare()
+    compared, moves = _ThingsBetween(things, earlier, later, where, places).compare()
+    view.notes.add(*look_alike_notes(things, moves))
+    return frame, compared
 
 
 def _are_of_one_run(sides: tuple[_Side, _Side]) -> bool:
@@ -311,10 +319,11 @@ class _ThingsBetween:
     where: Where | None
     places: Sequence[Place]
 
-    def compare(self) -> ComparedThings:
-        """Returns what differs, each list with the things seen last first."""
+    def compare(self) -> tuple[ComparedThings, Sequence[Move]]:
+        """Returns what differs, each list with the things seen last first, and the moves."""
         lists: dict[_Kind, list[ComparedThing]] = defaultdict(list)
         not_looked_at: list[tuple[Instance, ComparedThing]] = []
+        moves: list[Move] = []
         same = 0
         for instance in self.known.estimate.instances:
             before = self._last_stay(instance, self.earlier, self.later.start)
@@ -326,6 +335,8 @@ class _ThingsBetween:
             if not self._is_inside(instance, before) and not self._is_inside(instance, after):
                 continue
             kind, thing = self._difference(instance, before, after)
+            if kind == "moved" and before is not None and after is not None:
+                moves.append(Move(instance, before.stay, after.stay))
             if kind == "same":
                 same += 1
             elif kind == "not_looked_at":
@@ -335,7 +346,7 @@ class _ThingsBetween:
         lists["not_looked_at"], lists["not_comparable"] = _pair_across_runs(not_looked_at)
         ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
-        return ComparedThings(**ordered, same=same, movers=movers)
+        return ComparedThings(**ordered, same=same, movers=movers), moves
 
     def _is_inside(self, instance: Instance, stay: _StayInWindow | None) -> bool:
         """Returns whether a thing has a stay in the region."""

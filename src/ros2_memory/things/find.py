@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, UsualPlace
 from ros2_memory.things.instances import (
     Instance,
+    Move,
     Mover,
     PlacedStay,
     count_labels,
@@ -33,7 +35,13 @@ from ros2_memory.things.instances import (
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.routine import usual_places
-from ros2_memory.things.unseen import ThingsQuestion, describe_hung, note_undecoded, notes_on
+from ros2_memory.things.unseen import (
+    ThingsQuestion,
+    describe_hung,
+    look_alike_notes,
+    note_undecoded,
+    notes_on,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -110,6 +118,7 @@ def find_things(
     if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
     shown = tuple(finder.describe(thing) for thing in found[:limit])
+    view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
@@ -370,6 +379,14 @@ class _Finder:
         if isinstance(thing, Mover):
             return replace(shown, moves=True, usually=self._usual_places(frame, rows))
         return self._with_history(shown, thing, rows)
+
+    def moves(self, things: Iterable[_FoundThing]) -> Iterator[Move]:
+        """Yields the moves of things from place to place in the window."""
+        for found in things:
+            if isinstance(found.thing, Instance):
+                groups = _grouped_by_place(self._stays_in_window(found.thing))
+                for before, after in pairwise(groups):
+                    yield Move(found.thing, before[-1].stay, after[0].stay)
 
     def _with_history(self, shown: Thing, instance: Instance, rows: Ints) -> Thing:
         """Returns a described thing with its names, its stays, and whether it is still there."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -90,6 +90,31 @@ class Instance:
     def label(self) -> str:
         """The name to show."""
         return next(iter(self.labels), self.key)
+
+
+class Move(NamedTuple):
+    """A thing, its last stay before it moved and the first one after it."""
+
+    thing: Instance
+    before: PlacedStay
+    after: PlacedStay
+
+    def may_be_of(self, other: Instance) -> bool:
+        """Returns whether another thing may have come to the new place, or from the old one.
+
+        That is one which was first seen after the move began, or left its place before it ended. It
+        also left if nobody looked, where the same is true of the thing that moved.
+        """
+        if other.stays[0].first > self.before.last:
+            return True
+        is_seen = self.before.left is not None
+        return any(
+            stay.last <= self.after.first
+            and not (is_seen and stay.left is None)
+            and (following is None or following.first >= self.after.first)
+            and (following is None or following.place != stay.place)
+            for stay, following in zip_longest(other.stays, other.stays[1:])
+        )
 
 
 @dataclass(slots=True)
@@ -188,6 +213,16 @@ class Estimate:
         first, last = (self.spots[rows, column] for column in (Spot.FIRST, Spot.LAST))
         inside = (first < window.stop) & (last >= window.start) & (last < before)
         return rows[inside & (self.counts[rows] > 0)]
+
+    def look_alikes(self, move: Move) -> int:
+        """Returns how many other things of one label may be the one that moved; see `may_be_of`."""
+        thing = move.thing
+        return sum(
+            other is not thing
+            and (other.key, other.epoch) == (thing.key, thing.epoch)
+            and move.may_be_of(other)
+            for other in self.instances
+        )
 
     def is_vague(self, rows: Ints) -> bool:
         """Returns whether the newest of the spots was seen while localisation was poor."""

@@ -50,11 +50,12 @@ from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.things.instances import Move
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
@@ -279,6 +280,22 @@ def vague_notes(
             "localisation was poor when these were detected last, which moves nothing, so that "
             f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
             labels,
+        )
+
+
+def look_alike_notes(known: KnownThings, moves: Iterable[Move]) -> Iterator[str]:
+    """Yields the labels of moves that may be of other things, and of how many."""
+    most: dict[str, int] = {}
+    for move in moves:
+        others = known.estimate.look_alikes(move)
+        if others:
+            most[move.thing.label] = max(others, most.get(move.thing.label, 0))
+    if most:
+        labels = [f"{label} (or {others} more)" for label, others in sorted(most.items())]
+        yield repeating(
+            "which one of a label moved is a guess, since others of it came or went meanwhile: "
+            f"{listed(labels, at_most=_MOST_NAMED)}",
+            most,
         )
 
 

@@ -140,10 +140,10 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
 def test_episodes_of_one_robot_and_sightings_of_another_are_on_one_page(
     tmp_path: Path, limit: int, first: bool
 ) -> None:
-    """One robot ends its tasks with an empty text, the other by the next task."""
+    """One robot ends its tasks with an empty text, the other says what is no state."""
     for robot, late, tasks in (
         ("r1", 0, ("tidy", "", "cook", "", "tidy", "")),
-        ("r2", 5, ("tidy", "cook") * 3),
+        ("r2", 5, ("tidy", "cook it") * 3),
     ):
         at = [(START_S + 20 * nth + late) * S for nth in range(6)]
         said = [text(*each, "/task") for each in zip(at, tasks, strict=True)]

@@ -369,6 +369,37 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
     assert ask(tmp_path / "moved", QuerySettings())["labels"] == {"mug": 1}
 
 
+GUESS = "which one of a label moved is a guess, since others of it came or went meanwhile: "
+
+
+def pallets(*rows: float) -> list[Seen]:
+    return [("pallet", 3.0, y) for y in rows]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "guess"),
+    [
+        (pallets(-1.5, 0.0), pallets(1.5), "pallet (or 1 more)"),
+        (pallets(-1.5), pallets(0.0, 1.5), "pallet (or 1 more)"),
+        (pallets(-1.5), pallets(1.5), ""),
+        (pallets(-1.5, 0.0), pallets(0.0, 1.5), ""),
+    ],
+    ids=["two went", "two came", "alone", "another stayed"],
+)
+def test_which_of_several_alike_moved_is_a_guess(
+    tmp_path: Path, before: list[Seen], after: list[Seen], guess: str
+) -> None:
+    write_splits(tmp_path, [*looked(0, 40, HERE, *before), *looked(60, 100, HERE, *after)])
+    found = ask(tmp_path, label="pallet")
+    assert [len(thing["moved"]) for thing in found["things"] if "moved" in thing] == [2]
+    windows = {"with_start": BEGIN, "with_end": BEGIN + 39, "start": BEGIN + 60, "end": BEGIN + 99}
+    compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows)
+    assert len(compared["things"]["moved"]) == 1
+    for reply in (found, compared):
+        guesses = [note for note in reply.get("notes", ()) if GUESS in note]
+        assert guesses == ([GUESS + guess] if guess else [])
+
+
 def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -> None:
     low = looked(0, 20, HERE, ("mug", 3.0, 0.5), score=0.3)
     strict = QuerySettings(min_score=0.5)
