@@ -59,7 +59,7 @@ from ros2_memory.history.driven_path import (
     newest_of_body,
     resolve_path_topic,
 )
-from ros2_memory.history.held_values import newest_stating, still_holds
+from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
 from ros2_memory.history.no_data import (
     decode,
     describe_lack,
@@ -199,6 +199,8 @@ def topic_range(
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
+    if fields:
+        note_unnamed(view, name, [sample.value for sample in shown], window.stop)
     note_no_fix(view, name, window, fields)
     samples = tuple(Sample(sample.time, sample.value) for sample in shown)
     return results.TopicRange(
@@ -927,6 +929,8 @@ def _as_value(
 ) -> results.TopicValue:
     """Returns a message as replies show it, with all notes of the view so far."""
     message, shown = _decode_shown(view, stored, fields)
+    if fields:
+        note_unnamed(view, stored.topic, [shown.value], stored.time + 1)
     return results.TopicValue(
         stored.topic,
         stored.type,

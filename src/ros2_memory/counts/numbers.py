@@ -28,6 +28,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S, Call, Memory
+from ros2_memory.history.held_values import note_unnamed
 from ros2_memory.history.no_data import no_data_between, require_fields, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
 from ros2_memory.history.robots import note_robots
@@ -555,6 +556,7 @@ def count_range(
         if window_cell is None:
             require_fields(view, name, (field,), binned.counted.stop)
             view.notes.add(f"{field} holds no number in the window")
+            note_unnamed(view, name, [{field: None}], binned.counted.stop)
             continue
         for column, kind in _CELL_COLUMNS.items():
             values = [None if cell is None else getattr(cell, column) for cell in cells]

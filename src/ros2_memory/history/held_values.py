@@ -26,11 +26,12 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import Spans, without
+from ros2_memory.core.text import listed, repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import Summary, names_others
+from ros2_memory.messages.conversions import Summary, names_beside, names_others
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -151,6 +152,11 @@ class HeldValues:
                 self._view.extractor.shown(message, newest.type, [self._field])
                 return
             break
+        if value is None and self._field is not None:
+            names = names_without(self._view, self._topic, self._field, until)
+            if names:
+                sentence = unnamed(self._topic, self._field, names)
+                raise InvalidArgumentsError(f"{asked}: {sentence}")
         if newest is not None and isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             raise InvalidArgumentsError(
@@ -308,7 +314,9 @@ class HeldValues:
         """Whether a message says nothing of the field: it names other elements (joints) alone."""
         if value is not None or self._field is None:
             return False
-        return names_others(self._view.extractor.exact(message, type_name), self._field)
+        extractor = self._view.extractor
+        path = extractor.own_path(self._field, type_name)
+        return names_others(extractor.exact(message, type_name), path)
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""
@@ -419,7 +427,51 @@ def _says_something(view: View, stored: StoredMessage, fields: Sequence[str]) ->
     ):
         return True
     value = extractor.exact(message, type_name)
-    return not all(names_others(value, field) for field in fields)
+    return not all(names_others(value, extractor.own_path(field, type_name)) for field in fields)
+
+
+def note_unnamed(view: View, topic: str, values: Sequence[JsonValue], until: Ns) -> None:
+    """Notes which named elements (joints) are null in values because messages do not name them.
+
+    Args:
+        view: of the call.
+        topic: of the messages.
+        values: the fields of messages by dot-path, as replies show them.
+        until: the newest messages before this log time are looked at.
+    """
+    shown = [value for value in values if isinstance(value, dict)]
+    fields = dict.fromkeys(chain.from_iterable(shown))
+    for field in fields:
+        if all(value.get(field) is None for value in shown):
+            names = names_without(view, topic, field, until)
+            if names:
+                view.notes.add(unnamed(topic, field, names))
+
+
+def unnamed(topic: str, field: str, names: Sequence[str]) -> str:
+    """Returns a sentence on a named element that the newest messages of a topic do not have."""
+    others = f"the newest messages of {topic} have no {field}, but name {listed(names)}"
+    return repeating(others, names)
+
+
+def names_without(view: View, topic: str, field: str, until: Ns) -> list[str]:
+    """Returns the names of elements in the newest messages before a log time, if none has a field.
+
+    Empty if one has it, or if the field names no element.
+    """
+    names: dict[str, None] = {}
+    window = TimeWindow(MIN_NS, until)
+    messages = view.stream.messages([topic], window, newest_first=True)
+    for stored in islice(messages, _MOST_TRIED):
+        message = view.bags.decode(stored)
+        if message is None:
+            continue
+        value = view.extractor.exact(message, stored.type)
+        path = view.extractor.own_path(field, stored.type)
+        if not names_others(value, path):
+            return []
+        names.update(dict.fromkeys(map(str, names_beside(value, path))))
+    return sorted(names)
 
 
 def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = False) -> Ns:

@@ -25,7 +25,14 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
-from ros2_memory.history.held_values import held_at, held_until, holds_on, is_latched, is_text
+from ros2_memory.history.held_values import (
+    held_at,
+    held_until,
+    holds_on,
+    is_latched,
+    is_text,
+    note_unnamed,
+)
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots_on
@@ -565,6 +572,9 @@ def _with_fields(
         sightings.append(narrowed)
     if refused and len(refused) == len(sightings):
         raise refused.pop(0)
+    if fields and sightings:
+        values = [sighting.value for sighting in sightings]
+        note_unnamed(view, sightings[0].topic, values, sightings[0].last + 1)
     return sightings
 
 

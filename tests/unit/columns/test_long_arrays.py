@@ -44,6 +44,41 @@ def grid() -> Msg:
 
 
 @each_way
+@pytest.mark.parametrize("field", ["position.nope", "positions.nope"])
+def test_a_joint_that_no_message_names_is_answered_with_those_that_they_do(
+    tmp_path: Path, field: str, recalls: bool
+) -> None:
+    """Two nodes publish joints of one robot."""
+    messages: list[Msg] = []
+    for nth in range(0, 20, 2):
+        messages.append(joint_state(nth, ["elbow", "wrist"], [nth / 10, 1.0]))
+        messages.append(joint_state(nth + 1, ["wheel"], [nth]))
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    ask = partial(asked, memory, topic="/joints")
+    window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 19}
+    note = f"the newest messages of /joints have no {field}, but name elbow, wheel, wrist"
+    at_once = {"timestamp": window["end"], "fields": [field]}
+    assert note in ask("get_topic_at_time", **at_once)["notes"]
+    assert note in ask("get_topic_in_range", fields=[field], **window)["notes"]
+    assert note in ask("get_topic_in_range", fields=[field], by="hour", **window)["notes"]
+    for how in ({"changes": True}, {"by": "value"}):
+        refused = ask("get_topic_in_range", fields=[field], **how, **window)
+        assert refused["detail"].endswith(note)
+    moved = {"condition_type": "above", "value": 1.0, "field": "positions.elbow"}
+    assert note in ask("find_matches", **moved, fields=[field])["notes"]
+    elbow = field.replace("nope", "elbow")
+    at_once |= {"fields": [elbow], "tolerance_s": 1.5}
+    assert ask("get_topic_at_time", **at_once)["value"] == {elbow: 1.8}
+    for reply in (
+        ask("get_topic_at_time", **at_once),
+        ask("get_topic_in_range", fields=[elbow], **window),
+        ask("get_topic_in_range", fields=[elbow], changes=True, **window),
+        ask("find_matches", **moved, fields=[elbow]),
+    ):
+        assert "but name" not in str(reply)
+
+
+@each_way
 @pytest.mark.parametrize("message", [grid(), octets(T0, [7] * 100, "/data")], ids=lambda m: m.type)
 def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
     tmp_path: Path, message: Msg, recalls: bool
