@@ -58,6 +58,7 @@ builtin_interfaces/Time stamp
 uint8[16] client_gid
 int64 sequence_number
 """
+_KIND: Final = re.compile(r"/(?:srv|action)/")
 _SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _MSG_NOISE: Final = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_PIECE: Final = re.compile(
@@ -110,11 +111,11 @@ class Typestores:
     """Deserializers by schema content. Thread-safe.
 
     Args:
-        custom_msg_paths: folders that contain `<package>/msg/*.msg` at any depth, or a package. If
-            several folders have a type, the first one counts.
+        custom_msg_paths: folders that contain `<package>/msg/*.msg` or `<package>/action/*.action`
+            at any depth, or a package. If several folders have a type, the first one counts.
 
     Raises:
-        ConfigError: a path is not a folder, has no `.msg` file in it, or cannot be read.
+        ConfigError: a path is not a folder, has no such file in it, or cannot be read.
     """
 
     def __init__(self, custom_msg_paths: Sequence[Path | str] = ()) -> None:
@@ -212,9 +213,10 @@ class Typestores:
                 return parsed
             raise _UnusableError(f"its definition defines {', '.join(parsed)}, not {name}")
         missing = f"its part {name} (in {trail[-1]})" if trail else "it"
+        kind = "action" if "/action/" in name else "msg"
         raise _UnusableError(
             f"{missing} has no definition in the bag, in the configured folders or among the"
-            " standard types; put the package's .msg folder into reader.custom_msg_paths"
+            f" standard types; put the package's .{kind} folder into reader.custom_msg_paths"
         )
 
 
@@ -311,11 +313,10 @@ def _parse(name: str, section: _Section) -> Typesdict:
     try:
         if is_idl:
             return get_types_from_idl(text)
-        if "/srv/" not in name:
-            return get_types_from_msg(text, name)
-        # The parser knows names of messages alone.
-        parsed = get_types_from_msg(text, name.replace("/srv/", "/msg/"))
-        return {name: parsed[name.replace("/srv/", "/msg/")]}
+        # Names without a package are of messages, also in services and actions.
+        message = _KIND.sub("/msg/", name)
+        parsed = get_types_from_msg(text, message)
+        return {name: parsed[message]} if message != name else parsed
     # The parser raises its own error, or whatever Python does with what it took for a number.
     except Exception as error:
         reason = f"its definition of {name} cannot be parsed: {_brief(error)}"
@@ -409,24 +410,47 @@ def _unsigned(field: FieldDesc) -> FieldDesc:
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
-    """Yields (type name, text) of every `<package>/msg/<Name>.msg` below the folder."""
+    """Yields (type name, text) of every `<package>/msg/<Name>.msg` below the folder.
+
+    And of the feedback of every `<package>/action/<Name>.action`.
+    """
     if not folder.is_dir():
         raise ConfigError(
             f"reader.custom_msg_paths: {folder} is not a folder; give a folder of packages, or one"
             " package, with msg/*.msg in it"
         )
     try:
-        files = sorted(directories.files_below(folder.resolve(), ".msg"))
-        files = [file for file in files if file.parent.name == "msg"]
+        files = [
+            file
+            for kind in ("msg", "action")
+            for file in sorted(directories.files_below(folder.resolve(), f".{kind}"))
+            if file.parent.name == kind
+        ]
         if not files:
-            raise ConfigError(f"reader.custom_msg_paths: {folder} holds no msg/*.msg file")
+            raise ConfigError(
+                f"reader.custom_msg_paths: {folder} holds no msg/*.msg or action/*.action file"
+            )
         folders = {file.parent.parent for file in files}
         packages = {package: _package_name(package) for package in folders}
         for file in files:
             text = file.read_text(encoding="utf-8", errors="replace")
-            yield f"{packages[file.parent.parent]}/msg/{file.stem}", text
+            package = packages[file.parent.parent]
+            if file.suffix == ".msg":
+                yield f"{package}/msg/{file.stem}", text
+            else:
+                yield from _feedback_of(f"{package}/action/{file.stem}", text)
     except OSError as error:
         raise ConfigError(f"reader.custom_msg_paths: {folder} cannot be read: {error}") from error
+
+
+def _feedback_of(action: str, text: str) -> Iterator[tuple[str, str]]:
+    """Yields the names and texts of an action's feedback, and of the message that has it."""
+    _, _, *feedback = _SERVICE.split(text)
+    if feedback:
+        fields = _MSG_NOISE.sub("", feedback[0] + "\n").strip()
+        yield f"{action}_Feedback", fields or "uint8 structure_needs_at_least_one_member"
+        message = f"unique_identifier_msgs/UUID goal_id\n{action}_Feedback feedback\n"
+        yield f"{action}_FeedbackMessage", message
 
 
 def _package_name(package: Path) -> str:

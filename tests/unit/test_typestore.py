@@ -1,4 +1,5 @@
 import shutil
+import struct
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -276,6 +277,31 @@ def test_a_package_a_folder_of_packages_and_an_installed_tree_are_all_found(
         assert isinstance(found, MessageType)
 
 
+def test_feedback_of_an_action_is_decoded_by_its_action_file(tmp_path: Path) -> None:
+    name = "cleaning_msgs/action/Clean_FeedbackMessage"
+    missing = Typestores().lookup(name, "", b"")
+    assert "put the package's .action folder into reader.custom_msg_paths" in str(missing)
+    package = tmp_path / "cleaning_msgs"
+    (package / "action").mkdir(parents=True)
+    (package / "msg").mkdir()
+    (package / "msg" / "Spot.msg").write_text("float32 dirt\n")
+    actions = {
+        "Clean": "string room\n---\nbool done\n---\n# So far.\nSpot spot\nuint32 rooms\n",
+        "Stop": "---\n---\n",
+    }
+    for action, content in actions.items():
+        (package / "action" / f"{action}.action").write_text(content)
+    stores = Typestores([tmp_path])
+    found = stores.lookup(name, "", b"")
+    assert isinstance(found, MessageType)
+    payload = bytes((0, 1, 0, 0, *range(16))) + struct.pack("<fI", 0.5, 3)
+    message: Any = found.deserialize(payload)
+    assert (message.goal_id.uuid.tolist(), message.feedback.rooms) == ([*range(16)], 3)
+    assert message.feedback.spot.dirt == 0.5
+    empty = stores.lookup("cleaning_msgs/action/Stop_FeedbackMessage", "", b"")
+    assert isinstance(empty, MessageType)
+
+
 def test_the_name_in_package_xml_counts_before_the_folders(vision: Path) -> None:
     (vision / "package.xml").write_text("<package><name>other_msgs</name></package>")
     stores = Typestores([vision])
@@ -288,7 +314,7 @@ def test_a_wrong_path_stops_the_start_and_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"custom_msg_paths: .*missing is not a folder"):
         Typestores([missing])
     missing.mkdir()
-    with pytest.raises(ConfigError, match=r"missing holds no msg/\*\.msg file"):
+    with pytest.raises(ConfigError, match=r"missing holds no msg/\*\.msg or action"):
         Typestores([missing])
 
 

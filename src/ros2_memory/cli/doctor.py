@@ -312,7 +312,7 @@ def _faults(
     for topic in covered.undecodable:
         do = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
         if _MSG_FOLDERS in topic.reason:  # a definition is missing
-            do = f"name the folder with the .msg files in {_MSG_FOLDERS}"
+            do = f"name the folder with the .msg or .action files in {_MSG_FOLDERS}"
         yield _Fault("topic", "cannot be decoded", do), f"{topic.topic} ({topic.reason})"
 
 

@@ -151,7 +151,7 @@ def _decode_cdr(message_type: MessageType, payload: bytes) -> object:
     if not message_type.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
         raise UnreadableError(
             "the definition in the bag is empty and the message is not; put the package's .msg"
-            " folder into reader.custom_msg_paths"
+            " or .action folder into reader.custom_msg_paths"
         )
     if has_too_many_objects(message_type.fields, payload):
         raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
