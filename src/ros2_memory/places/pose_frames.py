@@ -109,14 +109,23 @@ def newest_pose(
 def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
     """Returns the recording of a topic around a log time; `own` if it is one, or if there is none.
 
-    The shortest one is chosen: a recording that began with an unset clock spans years. Whole
-    recordings are compared, since their bags depend on how they were split.
+    Where the topic is silent, since what it said before holds, a recording of the robot's poses
+    takes its place. The shortest one is chosen: a recording that began with an unset clock spans
+    years. Whole recordings are compared, since their bags depend on how they were split.
     """
-    spans = view.timeline.recordings(topic)
-    around = {path: last - first for path, (first, last) in spans.items() if first <= at <= last}
-    if own in around or not around:
-        return own
-    return min(around, key=lambda path: (around[path], path))
+    for spoken in (topic, _topic_of_robot(view)):
+        spans = view.timeline.recordings(spoken).items()
+        around = {path: last - first for path, (first, last) in spans if first <= at <= last}
+        if own in around:
+            return own
+        if around:
+            return min(around, key=lambda path: (around[path], path))
+    return own
+
+
+def _topic_of_robot(view: View) -> str:
+    """Returns the topic that places the robot."""
+    return view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
@@ -129,8 +138,7 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
         InvalidArgumentsError: no transform leads to `frame_id` at any time.
     """
     window = TimeWindow.before(at, NEWEST_POSE_NS)
-    topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
-    stored, pose = newest_pose(view, topic, window, recording) or (None, None)
+    stored, pose = newest_pose(view, _topic_of_robot(view), window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     in_frame = pose_if_placed(view, pose, stored.time, stored.bag.recording, frame_id)

@@ -25,6 +25,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.tools.replies import as_json
 from tests.support.bags import (
+    McapLayout,
     Msg,
     boolean,
     detections,
@@ -491,6 +492,30 @@ def test_a_state_without_an_empty_text_holds_until_the_next_one(
     found = [(row["seconds"], row.get("ended", True)) for row in reply["episodes"]]
     assert found == lengths
     assert counted["seconds"] == sum(seconds for seconds, _ in lengths)
+
+
+@each_way
+def test_where_the_robot_was_is_known_long_after_a_topic_spoke(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Mode and task are said in the first run, and hold when the robot leaves its dock again."""
+    layout = McapLayout(latched=frozenset({"/mode"}))
+    for name, begin in (("a", 0), ("b", 100)):
+        run = [odom(BEGIN + at * S, at / 10) for at in range(begin, begin + 60)]
+        run += [
+            boolean(BEGIN + at * S, at < begin + 20, "/docked") for at in range(begin, begin + 60)
+        ]
+        if name == "a":
+            run += [text(BEGIN + 5 * S, "AUTO", "/mode"), text(BEGIN + 6 * S, "", "/task")]
+            run += [text(BEGIN + 7 * S, "mow", "/task")]
+        write_splits(tmp_path, run, 1000, name, layout=layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    undocked = {"topic": "/docked", "condition_type": "equals", "value": False}
+    given = {"condition_type": "contains", "while": undocked}
+    modes = asked(memory, "find_matches", topic="/mode", value="AUTO", **given)["sightings"]
+    tasks = asked(memory, "find_matches", topic="/task", value="mow", **given)["episodes"]
+    assert [row["robot"] and row["robot"]["x"] for row in modes] == [12.0, 2.0]
+    assert [row["robot"]["x"] for row in tasks] == [2.0]
 
 
 def test_of_more_episodes_than_are_counted_the_newest_are(
