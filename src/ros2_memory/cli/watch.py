@@ -20,6 +20,7 @@ from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import cut_spans, excluded_spans
+from ros2_memory.history.no_data import are_unlisted
 from ros2_memory.history.scan import count_messages
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
@@ -29,6 +30,7 @@ from ros2_memory.results import Status
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """Current rates are those of the newest data of this length, since the newest recording began."""
 AS_USUAL: Final = "as usual"
+SILENT: Final = "silent"
 LIVE_SPLITS: Final = 3
 LIVE_NS: Final[Ns] = 60 * NS_PER_S
 """The newest data is live up to this age, or up to `LIVE_SPLITS` splits if these are longer."""
@@ -123,12 +125,15 @@ def _rates(
         if timeline.is_log(topic) or is_cut or is_excluded:
             usual = None
         age_s, rate = max(unix_from_ns(latest - last), 0.0), int(count) / window_s
+        seen = assessment(rate, usual, age_s, window_s)
+        if seen == SILENT and are_unlisted(memory, [topic]):
+            seen = "not recorded"
         yield {
             "topic": topic,
             "rate_hz": round(rate, 3),
             "usual_hz": usual,
             "age_s": round(age_s, 3),
-            "assessment": assessment(rate, usual, age_s, window_s) if is_live else None,
+            "assessment": seen if is_live else None,
         }
 
 
@@ -141,7 +146,7 @@ def assessment(rate: float, usual: float | None, age_s: float, window_s: float) 
     if usual is None:
         return AS_USUAL
     if age_s > max(unix_from_ns(WINDOW_NS), _SILENT_PERIODS / usual):
-        return "silent"
+        return SILENT
     if usual * window_s >= _MIN_MESSAGES and rate < usual / 2:
         return "slow"
     if rate * window_s >= _MIN_MESSAGES and rate > usual * 2:

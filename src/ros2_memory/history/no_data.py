@@ -38,6 +38,7 @@ from ros2_memory.index.file_state import HELD_BACK
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.history.context import Memory
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
@@ -582,10 +583,10 @@ def _active_answers(view: View) -> bool:
     return all(aside.answers for aside in view.snapshot.active)
 
 
-def _are_unlisted(view: View, topics: Sequence[str]) -> bool:
-    """Whether a recorder runs whose list has none of the topics, or excludes those it has."""
-    heartbeat = view.memory.heartbeat()
-    if heartbeat is None or not heartbeat.is_live(view.memory.clock.now()):
+def are_unlisted(memory: Memory, topics: Sequence[str]) -> bool:
+    """Returns whether a recorder runs whose list has none of the topics, or excludes these."""
+    heartbeat = memory.heartbeat()
+    if heartbeat is None or not heartbeat.is_live(memory.clock.now()):
         return False
     taken, excluded = set[str](), set[str]()
     for line in heartbeat.listed:
@@ -599,7 +600,7 @@ def _advice(view: View, reason: NoDataReason, at: Ns, topics: Sequence[str] = ()
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is not None and latest is not None:
         yield f"the memory covers {unix_text(earliest)} to {unix_text(latest)}"
-    if reason is NoDataReason.NOT_CLOSED_YET and topics and _are_unlisted(view, topics):
+    if reason is NoDataReason.NOT_CLOSED_YET and topics and are_unlisted(view.memory, topics):
         yield (
             f"the recorder no longer records {listed(topics)} (recording.topics_file): ask about "
             "an earlier moment"

@@ -26,7 +26,7 @@ from ros2_memory.history.coverage import (
     unexcluded,
     unix_text,
 )
-from ros2_memory.history.no_data import nothing_here
+from ros2_memory.history.no_data import are_unlisted, nothing_here
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
@@ -96,7 +96,11 @@ def memory_status(memory: Memory, call: Call) -> Status:
         never_heard=() if heartbeat is None else _never_heard(snapshot, heartbeat),
         lost={} if heartbeat is None or not live else heartbeat.lost,
         fell_silent=tuple(_fallen_silent(memory, snapshot)),
-        silences=tuple(silences_of(memory, snapshot)),
+        silences=tuple(
+            silence
+            for silence in silences_of(memory, snapshot)
+            if not (silence.goes_on and are_unlisted(memory, [silence.topic]))
+        ),
         clock_steps=clock_steps(view),
         gaps=gaps_with_deleted(view, gaps),
         stalled=(len(stalls), sum(end - start for start, end in stalls)),
@@ -290,7 +294,8 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     """Yields topics that had messages often, and have none in the newest data.
 
     A topic from before a long gap does not count: it may be another robot's. Nor does a topic that
-    was silent for as long before, such as those of a robot that is docked at times.
+    was silent for as long before, such as those of a robot that is docked at times, nor one that
+    the recorder no longer records.
     """
     latest, latching = snapshot.dating.latest, memory.limits.latching
     begin = snapshot.newest_stretch
@@ -311,7 +316,8 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         since = TimeWindow(last + 1, latest + 1)
         excluded = length_in(excluded_spans(memory.index.bag_dir, since), last, latest)
         is_long = latest - last - excluded > max(SILENT_AFTER_NS, longest)
-        if is_long and not cut_spans(memory.index.bag_dir, topic, since):
+        is_cut = bool(cut_spans(memory.index.bag_dir, topic, since))
+        if is_long and not is_cut and not are_unlisted(memory, [topic]):
             yield SilentTopic(topic, last)
 
 

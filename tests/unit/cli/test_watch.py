@@ -12,6 +12,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap, write_splits
+from tests.support.heartbeats import beat
 from tests.support.program import Program
 
 
@@ -81,6 +82,15 @@ def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
     append_losses(bag_dir, [Loss("/chatter", begin, begin + 65 * NS_PER_S, 30, "forgotten")])
     output = exits(0, "watch --count 1").out
     assert "silent" not in output
+    assert rows_of(output)["/bumper"].endswith("slow")
+
+
+def test_a_topic_that_was_taken_from_the_list_is_not_called_silent(
+    bag_dir: Path, exits: Program
+) -> None:
+    beat(bag_dir, time.time_ns(), listed=("/odom", "/bumper"), recordings=("rec",))
+    output = exits(0, "watch --count 1").out
+    assert rows_of(output)["/chatter"].endswith("not recorded")
     assert rows_of(output)["/bumper"].endswith("slow")
 
 

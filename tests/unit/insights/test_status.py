@@ -191,6 +191,21 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     assert [each.topic for each in answer.fell_silent] == fell
 
 
+@pytest.mark.parametrize("is_listed", [False, True])
+def test_a_topic_that_was_taken_from_the_list_is_not_silent(
+    tmp_path: Path, is_listed: bool
+) -> None:
+    bumps = [boolean(BEGIN + t * S, True) for t in range(80)]
+    drive = [odom(BEGIN + t * S) for t in range(400)]
+    write_splits(tmp_path, [*bumps, *drive], 100)
+    listed = ("/odom", "/bumper") if is_listed else ("/odom",)
+    beat(tmp_path, BEGIN + 400 * S, listed=listed, recordings=("rec",))
+    reply = asked(memory_of(tmp_path, clock=SettableClock(BEGIN + 401 * S)), "memory_status")
+    silent = ["/bumper"] * is_listed
+    assert [row["topic"] for row in reply["fell_silent"]] == silent
+    assert [row["topic"] for row in reply.get("silences", ())] == silent
+
+
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
     limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
     memory = replace(remembering(tmp_path), limits=limits)
