@@ -360,6 +360,8 @@ class RecordingSessions:
         running: all sessions whose children have not ended, oldest first.
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None at most times.
+        must_rotate: whether a new recording is due: the list of topics or the clock was changed, or
+            a handover was given up. It stays until one is started.
         restarts: how often a recording had to be started again.
         heard: the topics that had a message in a closed split.
         closed_s: when a split was last closed, by the monotonic clock.
@@ -375,6 +377,7 @@ class RecordingSessions:
         self._bag_dir = self.orders.bag_dir
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
+        self.must_rotate = False
         self.running: tuple[RecordingSession, ...] = ()
         # By the old recording's name, until that has ended.
         self._completed: dict[str, HandoverTransfer] = {}
@@ -542,6 +545,7 @@ class RecordingSessions:
         self.events.info("recorder_started", recording=name, pid=child.pid)
         session = RecordingSession(name, child, Splits(directory, self.orders.reader), now)
         self.running += (session,)
+        self.must_rotate = False
         return session
 
     def _update_list(self, session: RecordingSession) -> None:
@@ -637,7 +641,7 @@ class RecordingSessions:
 
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session of a handover; the old one continues."""
-        self.handover = None
+        self.handover, self.must_rotate = None, True
         self._unsettled.append(handover.directories)
         with self._reporting_failures(handover.old):
             give_up(*handover.directories)

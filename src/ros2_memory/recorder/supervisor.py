@@ -109,7 +109,6 @@ class Supervisor:
         self._backoff = {"restart": Backoff(), "rotate": Backoff()}
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
-        self._rotate_now = False
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
@@ -180,7 +179,7 @@ class Supervisor:
             return
         now = self._now()
         if set_back(self._last, now, SET_BACK_NS):
-            self._rotate_now = True
+            self._sessions.must_rotate = True
             self._events.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now
         self._run_tasks(now)
@@ -314,7 +313,7 @@ class Supervisor:
         # rotated grows with the square of its age.
         is_over = current.age_s(now) >= self.orders.session_duration_s
         resubscribe = self._reception.rotation_due(current.name, now.monotonic_s)
-        is_wanted = self._rotate_now or is_silent or is_over or resubscribe is not None
+        is_wanted = self._sessions.must_rotate or is_silent or is_over or resubscribe is not None
         is_alone = self._sessions.handover is None
         may_rotate = is_alone and current.is_recording and current.splits.exists
         if not (is_wanted and may_rotate and self._is_due("rotate", 0.0, now)):
@@ -334,7 +333,6 @@ class Supervisor:
             self._events.fail("rotation_failed", str(error), recording=current.name)
             self._put_off("rotate", now)
             return
-        self._rotate_now = False
         if resubscribe is not None:
             self._report_resubscription(resubscribe, current.name, now)
 
@@ -351,7 +349,7 @@ class Supervisor:
         before = {*topics.selection.listed}
         if topics.look():
             after = {*topics.selection.listed}
-            self._rotate_now = True
+            self._sessions.must_rotate = True
             added, dropped = sorted(after - before), sorted(before - after)
             self._events.info("topics_changed", added=added, dropped=dropped)
         self._events.lasting("topics_refused", "", topics.refused)
@@ -365,7 +363,6 @@ class Supervisor:
             self._put_off("restart", now)
 
     def _begin_recording(self, now: ClockReading) -> None:
-        self._rotate_now = False
         self._reception.skip_latched(())
         try:
             make_bag_dir(self._bag_dir)

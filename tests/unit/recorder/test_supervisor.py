@@ -221,6 +221,18 @@ def test_a_clock_that_is_set_back_by_more_than_two_minutes_begins_a_new_recordin
     assert_what_stands_counts_once(world)
 
 
+def test_a_clock_that_is_set_back_once_more_while_a_new_recording_begins_has_it_tried_again(
+    world: World,
+) -> None:
+    world.run(7)
+    world.set_clock(-3600)
+    world.run(3)
+    world.set_clock(-0.5)
+    world.run(20)
+    assert len(world.recorders) == 3
+    assert len(world.running) == 1
+
+
 def test_a_clock_that_is_set_back_while_nothing_records_cuts_no_recording_short(
     world: World,
 ) -> None:
@@ -523,6 +535,19 @@ def test_a_changed_list_begins_a_recording_and_loses_nothing(tmp_path: Path) -> 
     world.run(60)
     assert world.heartbeat()["fell_silent"] == []
     assert len(world.recorders) == 2
+    assert_what_stands_counts_once(world)
+
+
+def test_a_changed_list_is_used_though_the_first_recorder_with_it_dies(tmp_path: Path) -> None:
+    world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
+    world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
+    world.topics_path.write_text("topics: [/bumper, /lidar]\n")
+    world.run(5)
+    world.recorders[1].die()
+    world.run(30)
+    beat = world.heartbeat()
+    assert (beat["listed"], beat["subscribed"]) == (["/bumper", "/lidar"],) * 2
+    assert len(world.recorders) == 3
     assert_what_stands_counts_once(world)
 
 
