@@ -12,6 +12,7 @@ import gc
 import hashlib
 import json
 import os
+from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -281,16 +282,18 @@ def _triggers_builder(
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
     """Returns a function that builds the triggers of `rules` for a keeper of moments."""
-    from ros2_memory.recorder.process.topics import load_topics
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.triggers.rules import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
+    topics = TopicsFile(settings.recording.topics_file)
+    with suppress(ConfigError):  # the recorder refuses it
+        topics.load()
+
     def is_recorded(topic: str) -> bool:
-        """Whether the list of topics has a topic now; True if the list has become invalid."""
-        try:
-            return load_topics(settings.recording.topics_file).matches(topic)
-        except ConfigError:
-            return True
+        """Whether the list of topics that is in use now has a topic."""
+        topics.look()
+        return topics.selection.matches(topic)
 
     return partial(
         Triggers,

@@ -110,6 +110,7 @@ class Triggers:
             if rule.kind == "recorder_restart":
                 self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
+            self._check_topic(rule, state.rules[name])
             self._store_moments(name, state.rules[name], snapshot)
             if rule.kind == "message":
                 _note_lasting_match(name, state.rules[name])
@@ -186,9 +187,8 @@ class Triggers:
             state.searched = self._searched_by_part(state, snapshot)
         state = state or self._new_state(snapshot)
         state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
-        for name, record in state.rules.items():
+        for record in state.rules.values():
             record.problem = problem or record.problem
-            self._check_topic(self._rules[name], record)
         self._state = state
         return state
 
@@ -216,16 +216,16 @@ class Triggers:
         return searched | state.searched
 
     def _check_topic(self, rule: Rule, record: RuleRecord) -> None:
-        """Stores and logs whether a rule can never fire since its topic is not recorded."""
+        """Stores and logs whether a rule can never fire since its topic is not recorded now."""
         topic = rule.topic
         if topic is None or any(mark in topic for mark in GLOB_MARKS):
             return
         never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
-        if not self.is_recorded(topic):
+        if self.is_recorded(topic):
+            record.problem = None if record.problem == never else record.problem
+        elif record.problem != never:
             record.problem = never
             _log.warning("rule_not_recorded", rule=rule.name, reason=never)
-        elif record.problem == never:
-            record.problem = None
 
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
