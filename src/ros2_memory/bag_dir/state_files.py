@@ -56,11 +56,11 @@ from ros2_memory.bag_dir.layout import (
     has_own_name,
     utc_day,
 )
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
@@ -386,6 +386,27 @@ class Thinned:
             tuple((start, end) for start, end in self.pauses if stays(end)),
             tuple((time, by) for time, by in self.set_back if stays(time)),
             tuple(filter(stays, self.left_open)),
+        )
+
+    def without(self, spans: Spans, topics: Collection[str] | None = None) -> Thinned:
+        """Returns what is not in spans of log time; of some topics only their silences go."""
+
+        def stays(first: Ns, last: Ns) -> bool:
+            return not overlaps_any(spans, first, last)
+
+        silences = tuple(
+            silence
+            for silence in self.silences
+            if stays(*silence[1:3]) or (topics is not None and silence[0] not in topics)
+        )
+        if topics is not None:
+            return replace(self, silences=silences)
+        return Thinned(
+            self.since,
+            silences,
+            tuple((start, end) for start, end in self.pauses if stays(start, end)),
+            tuple((time, by) for time, by in self.set_back if stays(time, time)),
+            tuple(time for time in self.left_open if stays(time, time)),
         )
 
 

@@ -63,10 +63,11 @@ from ros2_memory.retention.repair import (
 from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.spans import Spans
 
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
@@ -219,7 +220,7 @@ class Eraser:
         notes = correct_metadata_files(self.bag_dir, recordings, self.reader)
         try:
             self._delete_leftovers(erasure)
-            self._forget_silences(erasure)
+            self.forget_thinned([*erasure.windows], erasure.topics)
             forgotten(erasure)
             self._report_losses(erasure)
             if not kept:
@@ -254,8 +255,8 @@ class Eraser:
         )
         append_losses(self.bag_dir, [loss for loss in losses if loss not in known])
 
-    def _forget_silences(self, erasure: Erasure) -> None:
-        """Deletes the silences of forgotten topics and windows from the memory of deleted bags.
+    def forget_thinned(self, spans: Spans, topics: Collection[str] | None = None) -> None:
+        """Deletes what the memory of deleted bags has of spans; of some topics, their silences.
 
         Raises:
             BagError: the file is damaged, or a recorder runs, which alone may write it.
@@ -265,18 +266,11 @@ class Eraser:
             thinned = THINNED.read(self.bag_dir) or Thinned()
         except ValueError as error:
             raise BagError(THINNED_FILE, f"it is damaged, delete it: {error}") from error
-        left = []
-        for silence in thinned.silences:
-            topic, first, last, *_ = silence
-            is_forgotten = topic in erasure.topics and any(
-                start <= last and first < stop for start, stop in erasure.windows
-            )
-            if not is_forgotten:
-                left.append(silence)
-        if len(left) < len(thinned.silences):
+        left = thinned.without(spans, topics)
+        if left != thinned:
             if self.recorder is not None:
                 raise BagError(THINNED_FILE, _recorder_refuses(self.recorder))
-            THINNED.write(self.bag_dir, replace(thinned, silences=tuple(left)))
+            THINNED.write(self.bag_dir, left)
 
     def _paths_of(self, inode: Identity) -> Sequence[Path]:
         return self._paths_by_inode().get(inode, ())

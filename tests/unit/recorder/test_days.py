@@ -70,6 +70,7 @@ from tests.support.housekeepers import keeper_of, own_all
 from tests.support.memories import reply_over, shipped_extractor
 from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
+from tests.unit.cli.conftest import locked
 
 S = NS_PER_S
 T0 = 1_790_000_400 * S  # 13:20 on 21 September 2026
@@ -938,6 +939,23 @@ def test_a_silence_is_forgotten_with_its_topic(
     exits(0, "forget --topic /vision/*", *window, "--yes")
     assert not read_thinned(blind).silences
     assert not reply_over(blind, "data_time_range").get("silences")
+
+
+def test_a_silence_is_forgotten_with_its_day_but_not_beside_a_recorder(
+    blind: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    split(blind, 2 * 86_400, name="rec_B")
+    keep_all(blind, "rec_B")
+    shutil.rmtree(blind / "rec_B")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(blind))
+    words = ("--start", T0_S, "--end", T0_S + 3600, "--yes")
+    with locked(blind):
+        assert "only the recorder may" in exits(1, "forget", *words).out
+    assert (blind / DAY_FILE).exists()
+    exits(0, "forget", *words)
+    assert not (blind / DAY_FILE).exists()
+    asked = reply_over(blind, "data_time_range", start=T0_S, end=T0_S + 3600)
+    assert (asked["silences"], read_thinned(blind).silences) == ([], ())
 
 
 def test_a_silence_of_deleted_bags_goes_on_and_ends_as_others_show(bag_dir: Path) -> None:

@@ -24,6 +24,8 @@ from ros2_memory.bag_dir.layout import (
     LOCK_FILE,
     MOMENTS_FOLDER,
     SHIPPED_FILE,
+    THINNED_FILE,
+    is_thinned,
     other_form,
 )
 from ros2_memory.bag_dir.lock import BagDirLock
@@ -57,6 +59,7 @@ from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import BagError, InvalidArgumentsError, RecorderError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -66,7 +69,7 @@ from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
-from ros2_memory.retention.repair import correct_metadata_files
+from ros2_memory.retention.repair import correct_metadata_files, reason_of
 from ros2_memory.storage.mcap.writer import McapWriter
 
 PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
@@ -394,19 +397,22 @@ class _Forget:
             carried, paths = None, {bag.path for bag in bags}
             if recorder is None:
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
-            else:  # it carries latched messages itself, and two programs must not do so at a time
-                latched = {bag.path for bag in self._carrier.with_latched(snapshot, paths)}
-                bags = [bag for bag in bags if bag.path not in latched]
+            else:  # it carries messages and writes days, and two programs must not do so at a time
+                held = {bag.path for bag in self._carrier.with_latched(snapshot, paths)}
+                held.update(bag.path for bag in bags if is_thinned(bag.file))
+                bags = [bag for bag in bags if bag.path not in held]
                 self.stays += [
-                    f"{self._name(path)}: it has latched messages, which only the recorder may "
-                    f"copy forward while it runs: {recorder}; stop the recorder, and forget again"
-                    for path in sorted(latched)
+                    f"{self._name(path)}: it has latched messages, or is a day of memory/, which "
+                    f"only the recorder may copy forward or change while it runs: {recorder}; stop "
+                    "the recorder, and forget again"
+                    for path in sorted(held)
                 ]
             self._ask_lake(bags)
             self._note_deletions(bags)
             deleted, freed = self._delete_files(bags)
             recordings = {bag.recording for bag in deleted}
             self._remove_emptied(recordings)
+            self._forget_days(deleted)
             try:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
@@ -482,6 +488,15 @@ class _Forget:
                 remove_emptied(self._bag_dir, recording)
             except OSError as error:
                 self.stays.append(f"{self._name(recording)}: {error.strerror or error}")
+
+    def _forget_days(self, deleted: Iterable[BagFile]) -> None:
+        """Deletes what `memory/` has of its deleted days besides their messages."""
+        spans = united((bag.start, bag.end + 1) for bag in deleted if is_thinned(bag.file))
+        try:
+            if spans:
+                self._eraser.forget_thinned(spans)
+        except (BagError, OSError) as error:
+            self.stays.append(f"{THINNED_FILE}: {reason_of(error)}")
 
     def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> None:
         """Stores what a lake has to forget."""
