@@ -34,7 +34,7 @@ LONGEST_SILENCE_S: Final = 60.0
 """A pause in which nothing reached the disk counts as recorded for at most so long."""
 STEP_NS: Final[Ns] = 60 * NS_PER_S
 """If the clock was set by less, dates are right enough to age by."""
-_MOST_LINES: Final = 20_000
+_SPARE_LINES: Final = 20_000
 _MAX_NAMED: Final = 5
 
 _log = get_logger(__name__)
@@ -181,10 +181,9 @@ class RecordedTime:
         for name in self._last_grew_s:
             self._last_grew_s[name] += newest.recorded_s
         self._total_s += newest.recorded_s
-        for name, row in last.items():
-            if row is newest or (self._bag_dir / name).is_dir():
-                self._last_grew_s[name] = row.recorded_s
-        self._lines = _MOST_LINES  # so that the next save leaves out what is gone
+        self._last_grew_s |= {name: row.recorded_s for name, row in last.items()}
+        # So that the next save leaves out what is gone.
+        self._lines = _SPARE_LINES + len(self._last_grew_s)
 
     def _read_rows(self) -> list[Recorded]:
         """Returns the rows of the file that are whole.
@@ -215,7 +214,8 @@ class RecordedTime:
         try:
             if self._unread is not None:
                 raise self._unread
-            if self._lines + len(names) > _MOST_LINES:
+            if self._lines + len(names) > _SPARE_LINES + len(self._last_grew_s):
+                self._drop_gone()
                 RECORDED.replace(self._bag_dir, self._rows(self._last_grew_s))
                 self._lines = len(self._last_grew_s)
             elif names:
@@ -229,6 +229,15 @@ class RecordedTime:
         else:
             self._unsaved.clear()
             self._reported = None
+
+    def _drop_gone(self) -> None:
+        """Drops the recordings that are gone, but for those that have the total."""
+        self._last_grew_s = {
+            name: grew_s
+            for name, grew_s in self._last_grew_s.items()
+            if grew_s == self._total_s or (self._bag_dir / name).is_dir()
+        }
+        self._right = self._right.intersection(self._last_grew_s)
 
     def _rows(self, names: Iterable[str]) -> list[Recorded]:
         return [

@@ -11,6 +11,7 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.timebase import ns_from_unix
+from ros2_memory.retention import recorded_time
 from ros2_memory.retention.disk import RETRIED_S, FailingFiles, HomeDisk, device_of
 from ros2_memory.retention.recorded_time import RecordedTime
 from tests.support.fakes import broken
@@ -45,6 +46,18 @@ def test_it_is_written_once_a_minute_so_that_a_kill_forgets_no_more(tmp_path: Pa
     assert [row.recorded_s for row in RECORDED.rows(tmp_path)] == [0, 60]
     recorded(RecordedTime(tmp_path), "b", 119, since_s=end)
     assert RecordedTime(tmp_path).since(["a"]) == {"a": 60 * S}
+
+
+def test_recordings_that_are_gone_are_dropped_without_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_time, "_SPARE_LINES", 10)
+    folders(tmp_path, "stays")
+    time, end = RecordedTime(tmp_path), 0.0
+    for name in ("stays", *map(str, range(50))):
+        end = recorded(time, name, 60, since_s=end)
+        assert len(RECORDED.rows(tmp_path)) < 25
+    assert RecordedTime(tmp_path).since(["stays", "49"]) == {"stays": 3000 * S, "49": 0}
 
 
 def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
