@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.index.segment import Pace, TopicTotals
 
@@ -621,9 +622,19 @@ class Arrivals:
         if not self._splits:
             return {}
         start = min(split.start for split in self._splits)
-        duration_s = max(self._newest + idle - start, 1) / NS_PER_S
-        counts = Counter[str]()
+        duration = max(self._newest + idle - start, 1)
+        counts, spans = Counter[str](), defaultdict[str, Spans](list)
         for split in self._splits:
             for name, arrival in split.arrivals.items():
                 counts[name] += arrival.messages
-        return {name: count / duration_s for name, count in counts.items()}
+                spans[name].append((arrival.first, arrival.last))
+        rates: dict[str, float] = {}
+        for name, of_topic in spans.items():
+            # In a rotation two recordings have the same messages.
+            twice = _length(of_topic) - _length(united(of_topic))
+            rates[name] = counts[name] * NS_PER_S / (duration + twice)
+        return rates
+
+
+def _length(spans: Spans) -> Ns:
+    return sum(stop - start for start, stop in spans)

@@ -519,6 +519,14 @@ def test_required_topics_are_missed_by_name_and_rate(tmp_path: Path) -> None:
     assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
 
 
+def test_a_topic_that_is_too_slow_is_missed_through_rotations(tmp_path: Path) -> None:
+    world = rotating(tmp_path, 40, required=[Required("/bumper", 4.3), Required("/door", 3.7)])
+    for _ in range(60):
+        world.run(1)
+        [missed] = world.heartbeat()["required_missing"]
+        assert missed.startswith("/bumper: 4")
+
+
 def test_a_changed_list_begins_a_recording_and_loses_nothing(tmp_path: Path) -> None:
     world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
     world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
