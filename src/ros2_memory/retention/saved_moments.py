@@ -89,7 +89,7 @@ def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
         else:
             ready.append(bag)
     waits = waits and abs(now - moment.asked) < LONGEST_WAIT_NS
-    return NeededBags(window, tuple(ready), waits, open_files if waits else ())
+    return NeededBags(window, tuple(ready), waits, open_files)
 
 
 @dataclass(slots=True)
@@ -349,6 +349,9 @@ class MomentKeeper:
                 self._refused.add(before.folder)
                 return before
             links = _Links([f"not all can be saved: {reason}"])
+        if not need.waits:
+            names = (os.path.relpath(path, self.bag_dir) for path in need.open_files)
+            links.missing += [f"{name} was still being written, or held back" for name in names]
         after = _with_links(before, need, links)
         self._refused.discard(before.folder)
         if after.moment != before.moment:

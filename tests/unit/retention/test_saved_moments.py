@@ -151,6 +151,21 @@ def test_a_moment_waits_for_the_split_that_is_being_written(tmp_path: Path) -> N
     assert names == [f"{A}_1.mcap", f"{A}_2.mcap"]
 
 
+def test_a_split_that_is_still_open_when_a_moment_waits_no_longer_is_named(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0, splits=2)
+    open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, McapLayout(chunk_size=400, finish=False))
+    now = SettableClock(open_one.stat().st_mtime_ns)
+    recording_now(tmp_path, A, clock=now)
+    house = house_of(tmp_path, clock=now)
+    assert kept(house, tmp_path, 15, 25, at=now.at).pending
+    now.at += 3 * 3600 * S  # as a robot without a clock of its own, when it finds a time server
+    recording_now(tmp_path, A, clock=now)
+    house.keep_moments()
+    reported = told_of(tmp_path)
+    assert (reported["pending"], reported["complete"]) == (False, False)
+    assert reported["missing"] == [f"{A}/{A}_2.mcap was still being written, or held back"]
+
+
 def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(tmp_path: Path) -> None:
     size = bag(tmp_path / A / f"{A}_0.mcap", 0).stat().st_size
     house, clock = waiting(tmp_path, moments_bytes=5 * size // 2)
