@@ -52,11 +52,12 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import (
-    Body,
+    body_at,
     body_of,
     driven_path,
     length_notes,
     newest_of_body,
+    no_path,
     resolve_path_topic,
 )
 from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
@@ -223,11 +224,9 @@ def position(
     """
     view, at, now = open_moment(memory, call, moment)
     name = resolve_path_topic(view, topic, degrees=True)
-    body = body_of(view, name)
-    if body is not None:
+    if body_of(view, name) is not None:
         return _position_of_body(
             view,
-            body,
             at,
             tolerance_s=tolerance_s,
             rest_s=moment.rest_s,
@@ -297,7 +296,6 @@ def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
 
 def _position_of_body(
     view: View,
-    body: Body,
     at: Ns,
     *,
     tolerance_s: float | None,
@@ -311,9 +309,9 @@ def _position_of_body(
         NoDataError: no transform places it at the moment, or within the tolerance before.
     """
     window, tolerance = _window_before(view, at, tolerance_s, rest_s)
-    newest = newest_of_body(view, body, window, frame_id)
+    newest = newest_of_body(view, window, frame_id)
     if newest is None:
-        raise _unplaced_error(view, body, at, tolerance, frame_id)
+        raise _unplaced_error(view, at, tolerance, frame_id)
     stored, pose = newest
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, window.stop))
@@ -330,12 +328,12 @@ def _position_of_body(
     return results.Position(topic, stored.time, pose, _age(stored, now), geodetic, notes=notes)
 
 
-def _unplaced_error(
-    view: View, body: Body, at: Ns, tolerance: Ns | None, frame_id: str | None
-) -> NoDataError:
+def _unplaced_error(view: View, at: Ns, tolerance: Ns | None, frame_id: str | None) -> NoDataError:
     """Returns why no transform places the robot's body at a moment."""
+    body = body_at(view, at)
     try:
-        frame_history.transform_at(view, frame_id or body.parent, body.child, at)
+        if body is not None:
+            frame_history.transform_at(view, frame_id or body.parent, body.child, at)
         error = no_data_at(view, view.moving_topics, at, tolerance)
     except NoDataError as no_transform:
         error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), no_transform)
@@ -638,7 +636,7 @@ def trajectory_summary(
     name = resolve_path_topic(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None:
-        raise no_data_between(view, (name,), window)
+        raise no_path(view, name, window)
     own_frame = path.frames[0]
     note_unrecorded(view, window)
     if len(path.frames) > 1:

@@ -27,7 +27,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, each_way, remembered
+from tests.support.memories import asked, each_way, memory_of, remembered
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -233,6 +233,53 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
     refused = asked(memory, "get_velocity_at", timestamp=T0_S + 1)["detail"]
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
+
+
+def carried_by(parent: str, begin_s: int, y: float) -> list[Msg]:
+    """Half a minute of transforms of the body, driving at 1 m/s."""
+    times = [T0 + begin_s * S + n * S // 10 for n in range(301)]
+    return [
+        tf(at, transform(at, parent, "base_link", (n / 10, y, 0.0))) for n, at in enumerate(times)
+    ]
+
+
+def test_a_body_that_another_run_hangs_below_another_frame_is_placed_in_both(
+    tmp_path: Path,
+) -> None:
+    runs = {"one": carried_by("odom", 0, 0.0), "two": carried_by("map", 3600, 5.0)}
+    for name, messages in runs.items():
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    for begin_s, y, frame in ((0, 0.0, "odom"), (3600, 5.0, "map")):
+        reply = asked(memory, "get_position_at", timestamp=T0_S + begin_s + 10)
+        assert (reply["x"], reply["y"], reply["frame_id"]) == (10.0, y, frame)
+        span = {"start": T0_S + begin_s, "end": T0_S + begin_s + 30}
+        reply = asked(memory, "trajectory_summary", **span)
+        assert (reply["distance_m"], reply["frame_id"], reply["poses"]) == (30.0, frame, 301)
+    reply = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 3630)
+    assert (reply["distance_m"], reply["poses"]) == (60.0, 602)
+    assert "poses in several frames were joined: odom, map" in reply["notes"]
+    reply = asked(memory, "visits", x=10.0, y=5.0)
+    assert (reply["frame_id"], reply["total"]) == ("map", 1)
+
+
+def test_transforms_that_do_not_place_the_body_are_named(tmp_path: Path) -> None:
+    """The second run has the arm alone: it is not the robot's way, and no lack of messages."""
+    arm = [
+        tf(at := T0 + (3600 + n) * S, transform(at, "shoulder", "hand", (0.1 * n, 0.0, 0.0)))
+        for n in range(30)
+    ]
+    for name, messages in {"one": carried_by("odom", 0, 0.0), "two": arm}.items():
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    reply = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 3630)
+    assert reply["distance_m"] == 30.0
+    left_out = "transforms of two are left out: none of them moves the robot's body"
+    assert left_out in reply["notes"]
+    reply = asked(memory, "trajectory_summary", start=T0_S + 3600, end=T0_S + 3630)
+    assert reply["reason"] == "frame_unknown"
+    assert "there are: hand, shoulder" in reply["detail"]
+    assert left_out in reply["notes"]
 
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
-from ros2_memory.history.driven_path import path_by_poses, resolve_path_topic
-from ros2_memory.history.no_data import no_data_between
+from ros2_memory.history.driven_path import no_path, path_by_poses, resolve_path_topic
 from ros2_memory.history.robots import note_robots, require_one_robot
 from ros2_memory.history.view import TimeRange, View, clamped, open_span, open_view, search_window
 from ros2_memory.places.driven_inside import totals_inside
@@ -68,7 +67,7 @@ def count_path(
     binned = BinnedWindow(view, asked, by, (name,), place_asked)
     path, since = path_by_poses(view, name, binned.counted)
     if path is None:
-        raise no_data_between(view, (name,), asked)
+        raise no_path(view, name, asked)
     binned.count_since(since)
     total_m = path.totals.distance_m
     edges = binned.bins.edges[1:-1]

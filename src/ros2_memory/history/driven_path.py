@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from itertools import chain, islice
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -34,11 +35,12 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
+    no_data_between,
     resolve_pose_topic,
     undecodable,
     with_notes,
@@ -55,6 +57,7 @@ from ros2_memory.history.scan import (
 )
 from ros2_memory.history.sessions import Session, decoded_transforms
 from ros2_memory.history.transforms import (
+    connects_in_time,
     edges_of_rows,
     frames_of,
     frames_over,
@@ -65,6 +68,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.model import FrameEdge
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
@@ -72,11 +76,9 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="Sized")
 
 _MOST_TRIED: Final = 1000
-"""How many of the newest poses are tried until one can be decoded."""
+"""How many of the newest messages are tried until one can be decoded, or places the robot."""
 _BODIES: Final = ("base_footprint", "base_link")
 """Names of the frame of the robot's body, the likelier first."""
-_HOUR_NS: Final = 3600 * NS_PER_S
-"""Transforms are read by the hour."""
 _LONGEST_H: Final = 64
 """In a bag that spans more hours a clock was set: decades may lie between two messages."""
 _STEP_NS: Final = NS_PER_S // 20
@@ -356,7 +358,6 @@ class Body(NamedTuple):
     Attributes:
         parent: the map, or the root of its frames.
         child: the frame of the body.
-        others: the other frames that move.
         above: the frames above it, the nearest first.
         odometry: the frame in which its path is measured: a correction of the map is not driven.
             `parent` if there is none of odometry.
@@ -365,37 +366,82 @@ class Body(NamedTuple):
 
     parent: str
     child: str
-    others: tuple[str, ...]
     above: tuple[str, ...]
     odometry: str
     beside: tuple[str, ...]
 
 
-def robot_body(view: View) -> Body | None:
-    """Returns the robot's body by its transforms; None if none of them moves.
+_ROBOT_BODIES: Final[Key[dict[Session | None, Body | None]]] = Key()
+"""Of a view: by session its `robot_body`, and by None the newest one."""
 
-    It is found by its name (`base_footprint`, `base_link`), else it is the moving frame that is
-    nearest to the root.
+
+def robot_body(view: View, session: Session | None = None) -> Body | None:
+    """Returns the robot's body by its transforms; None if none of them moves it.
+
+    The same frame is its body in all sessions. What is above it is asked of a session, without one
+    of the newest that moves it: another run may have other parents.
     """
-    edges = view.sessions.edges
-    parents = {edge.child: edge.parent for edge in edges}
-    moving = [edge.child for edge in edges if not edge.static]
-    if not moving:
+    bodies = view.memo.of(_ROBOT_BODIES, dict)
+    if session not in bodies:
+        newest = _newest_body(view) if session is None else robot_body(view)
+        if session is not None and newest is not None:
+            bodies[session] = _body_of_edges(view, view.sessions.edges_of(session), newest.child)
+        else:
+            bodies[session] = newest
+    return bodies[session]
+
+
+def _newest_body(view: View) -> Body | None:
+    """Returns the body by the transforms of the newest session that moves it."""
+    body = _body_of_edges(view, view.sessions.edges)
+    if body is None:
         return None
-    above = {child: _ancestors(child, parents) for child in moving}
+    recordings = chain.from_iterable(
+        view.timeline.recordings(topic).items() for topic in view.moving_topics
+    )
+    for path, _ in sorted(recordings, key=lambda recording: recording[1][1], reverse=True):
+        edges = view.sessions.edges_of(view.sessions.session_of(path))
+        newest = _body_of_edges(view, edges, body.child)
+        if newest is not None:
+            return newest._replace(beside=body.beside)
+    return body
+
+
+def _body_of_edges(view: View, edges: Sequence[FrameEdge], child: str | None = None) -> Body | None:
+    """Returns the body with a frame by some pairs of frames; None if they do not move it.
+
+    Without a `child` it is found by its name (`base_footprint`, `base_link`), else it is the moving
+    frame that is nearest to the root.
+    """
+    # If a frame is static in one parent and moves in another, the latter counts.
+    static_first = sorted(edges, key=attrgetter("static"), reverse=True)
+    parents = {edge.child: edge.parent for edge in static_first}
+    above = {edge.child: _ancestors(edge.child, parents) for edge in edges if not edge.static}
+    if not above or child not in (None, *above):
+        return None
     map_frame = view.limits.map_frame
-    body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
+    body = child or min(
+        above, key=lambda name: (_body_rank(name, map_frame), len(above[name]), name)
+    )
     root = map_frame if map_frame in above[body] else above[body][-1]
     odometry = next(filter(is_odometry, above[body]), root)
-    others = sorted({child for child in moving if child != body})
     beside = tuple(
-        child
-        for child in others
-        if _body_rank(child, map_frame) < len(_BODIES)
-        and child not in above[body]
-        and body not in above[child]
+        other
+        for other in sorted(above)
+        if _body_rank(other, map_frame) < len(_BODIES)
+        and other not in (body, *above[body])
+        and body not in above[other]
     )
-    return Body(root, body, tuple(others), tuple(above[body]), odometry, beside)
+    return Body(root, body, tuple(above[body]), odometry, beside)
+
+
+def body_at(view: View, at: Ns) -> Body | None:
+    """Returns the body by the transforms of the session that was recorded last before a moment."""
+    stored = view.stream.first(view.moving_topics, TimeWindow.until(at), newest_first=True)
+    if stored is None:
+        return robot_body(view)
+    session = view.sessions.lending_to(stored.bag.recording, stored.time)
+    return robot_body(view, session) or robot_body(view)
 
 
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -462,24 +508,28 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
 
 def newest_of_body(
     view: View,
-    body: Body,
     window: TimeWindow,
     frame_id: str | None = None,
     recording: Path | None = None,
 ) -> tuple[StoredMessage, Pose] | None:
     """Returns the newest transform in a window that places the robot's body, and its pose.
 
-    The pose is in `frame_id`, by default in `body.parent`. Only transforms of the session of a
-    `recording` count, if it has any.
+    The pose is in `frame_id`, by default in the `parent` of the body then. Only transforms of the
+    session of a `recording` count, if it has any. None if the newest thousand place nothing.
     """
-    parent, topics, sessions = frame_id or body.parent, view.moving_topics, view.sessions
+    topics, sessions = view.moving_topics, view.sessions
+    messages = view.stream.messages(topics, window, newest_first=True)
     own_session = None if recording is None else sessions.session_of(recording)
-    if own_session and not sessions.recordings_of(own_session, topics):
-        own_session = None
-    for stored in view.stream.messages(topics, window, newest_first=True):
-        if own_session and not sessions.has(own_session, stored):
-            continue
+    if own_session and sessions.recordings_of(own_session, topics):
+        messages = (stored for stored in messages if sessions.has(own_session, stored))
+    leads: dict[Session, bool] = {}
+    for stored in islice(messages, _MOST_TRIED):
         recorded_in = stored.bag.recording
+        session = sessions.lending_to(recorded_in, stored.time)
+        body = robot_body(view, session)
+        if body is None or not leads.get(session, True):
+            continue
+        parent = frame_id or body.parent
         for transform in decoded_transforms(view, [stored]):
             if transform.child.lstrip("/") != body.child:
                 continue
@@ -491,7 +541,27 @@ def newest_of_body(
                     view, parent, body.child, moment, recorded_in, explains=False
                 ).transform
                 return stored, Pose(placed.translation, placed.rotation, parent)
+            if session not in leads:
+                leads[session] = connects_in_time(view, (parent, body.child), session=session)
     return None
+
+
+def no_path(view: View, topic: str, window: TimeWindow) -> NoDataError:
+    """Returns the error for a window in which a topic has no pose.
+
+    If it has transforms there, the error says why these do not place the robot's body.
+    """
+    newest = None
+    if topic in view.limits.tf_topics:
+        newest = view.stream.first(view.moving_topics, window, newest_first=True)
+    body = None if newest is None else body_at(view, newest.time)
+    if newest is None or body is None:
+        return no_data_between(view, (topic,), window)
+    try:
+        transform_at(view, body.odometry, body.child, newest.time, newest.bag.recording)
+    except NoDataError as error:
+        return with_notes(view, window, error)
+    return no_data_between(view, (topic,), window)
 
 
 def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:
@@ -503,42 +573,50 @@ def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:
     Raises:
         QueryTimeoutError: while it is iterated or a block is read, the call's time is over.
     """
-    body = robot_body(view)
-    if body is None:
+    if robot_body(view) is None:
         return
     hours = set(chain.from_iterable(_hours_of(view, topic, window) for topic in view.moving_topics))
     for hour in sorted(hours, reverse=True):
-        piece = TimeWindow(hour * _HOUR_NS, (hour + 1) * _HOUR_NS).intersect(window)
+        piece = TimeWindow(hour * NS_PER_HOUR, (hour + 1) * NS_PER_HOUR).intersect(window)
         if not piece.empty:
-            read = partial(_poses_of_body, view, piece, body)
-            yield PoseRows(piece.start, piece.stop - 1, read)
+            yield PoseRows(piece.start, piece.stop - 1, partial(_poses_of_body, view, piece))
 
 
 def _hours_of(view: View, topic: str, window: TimeWindow) -> set[int]:
     """Returns the hours of a window, counted from the epoch, that may have messages of a topic."""
     hours: set[int] = set()
-    firsts, lasts = (times // _HOUR_NS for times in view.bounds(topic, window))
+    firsts, lasts = (times // NS_PER_HOUR for times in view.bounds(topic, window))
     is_short = lasts - firsts <= _LONGEST_H
     for first, last in zip(firsts[is_short].tolist(), lasts[is_short].tolist(), strict=True):
         hours.update(range(first, last + 1))
     if is_short.all():
         return hours
     for extent in view.timeline.extents(topic, window):
-        if extent.last // _HOUR_NS - extent.first // _HOUR_NS > _LONGEST_H:
+        if extent.last // NS_PER_HOUR - extent.first // NS_PER_HOUR > _LONGEST_H:
             for table in view.bags.tables(extent.bag, topic, window, columns=False):
-                hours.update(np.unique(table.log_times // _HOUR_NS).tolist())
+                hours.update(np.unique(table.log_times // NS_PER_HOUR).tolist())
     return hours
 
 
-def _poses_of_body(view: View, window: TimeWindow, body: Body) -> Poses:
-    """Returns the poses of the body in a window, by the transforms of all sessions."""
+def _poses_of_body(view: View, window: TimeWindow) -> Poses:
+    """Returns the poses of the body in a window, by the transforms of all sessions.
+
+    A note names sessions that have transforms then, and none that places it.
+    """
     bags = view.stream.overlapping_bags(view.moving_topics, window)
     sessions = dict.fromkeys(view.sessions.session_of(span.bag.recording) for span in bags)
-    poses = joined_poses([poses_by_session(view, window, session, body) for session in sessions])
+    of_sessions = {session: poses_by_session(view, window, session) for session in sessions}
+    poses = joined_poses([*of_sessions.values()])
+    for session in sessions:
+        if robot_body(view, session) is None:
+            names = view.sessions.names(session, window.start)
+            view.notes.add(
+                f"transforms of {names} are left out: none of them moves the robot's body"
+            )
     return poses.rows(_positions_apart(poses.times))
 
 
-def poses_by_session(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+def poses_by_session(view: View, window: TimeWindow, session: Session) -> Poses:
     """Returns the poses of the body in a window by the transforms of a session, in order of time.
 
     They are in the frame of its odometry; none if no transforms lead there.
@@ -546,6 +624,9 @@ def poses_by_session(view: View, window: TimeWindow, session: Session, body: Bod
     Raises:
         QueryTimeoutError: the call's time is over.
     """
+    body = robot_body(view, session)
+    if body is None:
+        return NO_POSES
     scanned = chain.from_iterable(scan(view, topic, window) for topic in view.moving_topics)
     edges = joined_edges([edges_of_rows(view, rows, session) for rows in scanned])
     poses = placed_body(
@@ -580,9 +661,9 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
     return poses.rows(np.flatnonzero(placed.valid))
 
 
-def sparse_poses_of_body(view: View, window: TimeWindow, session: Session, body: Body) -> Poses:
+def sparse_poses_of_body(view: View, window: TimeWindow, session: Session) -> Poses:
     """Returns the poses of `poses_by_session`, at most twenty a second."""
-    poses = poses_by_session(view, window, session, body)
+    poses = poses_by_session(view, window, session)
     return poses.rows(_positions_apart(poses.times))
 
 

@@ -450,23 +450,43 @@ class Sessions:
         frame is invalid in tf2, and is left out with a note. Another note says if there was no time
         for older bags.
         """
+        edges = self._edges_in(self._pairs_by_folder)
+        named = tuple(edge for edge in edges if is_edge((edge.parent, edge.child)))
+        if len(named) < len(edges):
+            left_out = len(edges) - len(named)
+            self._view.notes.add(f"pairs left out, since a frame has no name: {left_out}")
+        return named
+
+    def edges_of(self, session: Session) -> Sequence[FrameEdge]:
+        """Returns the pairs of a session, as `edges`; of all sessions if its own were not read."""
+        if self._pairs_by_folder.keys().isdisjoint(session - {self._carried}):
+            return self.edges
+        edges = self._edges_in(session)
+        return [edge for edge in edges if is_edge((edge.parent, edge.child))]
+
+    def _edges_in(self, folders: Iterable[str]) -> list[FrameEdge]:
+        pairs: dict[Pair, bool] = {}
+        for folder in folders:
+            for pair, is_static in self._pairs_by_folder.get(folder, {}).items():
+                pairs[pair] = is_static and pairs.get(pair, True)
+        return [FrameEdge(*pair, is_static) for pair, is_static in sorted(pairs.items())]
+
+    @cached_property
+    def _pairs_by_folder(self) -> Mapping[str, Mapping[Pair, bool]]:
+        """By folder its pairs, and whether each was published as static alone."""
         view = self._view
         reading = view.call.partial_after(READING_S)
-        pairs = dict.fromkeys(self.pairs(view.static_topics), True)
+        by_folder: dict[str, dict[Pair, bool]] = defaultdict(dict)
+        for topic in view.static_topics:
+            for recording, pairs in self._tables_back(topic, None):
+                by_folder[self.folder(recording)] |= dict.fromkeys(pairs, True)
         for topic in view.moving_topics:
-            for moving_pairs in self.pairs_back(topic, None):
-                pairs |= dict.fromkeys(moving_pairs, False)
+            for recording, pairs in self._tables_back(topic, None):
+                by_folder[self.folder(recording)] |= dict.fromkeys(pairs, False)
                 if reading.expired():
                     view.notes.add_lack("out of time: frames that only older bags have are missing")
                     break
-        edges = [
-            FrameEdge(*pair, is_static)
-            for pair, is_static in sorted(pairs.items())
-            if is_edge(pair)
-        ]
-        if len(edges) < len(pairs):
-            view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(edges)}")
-        return tuple(edges)
+        return by_folder
 
     def pairs(self, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
         """Returns the pairs of topics, of a session or of all."""
@@ -480,6 +500,12 @@ class Sessions:
 
         Each set is of one table.
         """
+        return (pairs for _, pairs in self._tables_back(topic, session, window))
+
+    def _tables_back(
+        self, topic: str, session: Session | None, window: TimeWindow | None = None
+    ) -> Iterator[tuple[Path, frozenset[Pair]]]:
+        """Yields `pairs_back`, each with its recording."""
         window = TimeWindow.everything() if window is None else window
         if session is not None:
             window = window.intersect(self._window_of(session, (topic,)))
@@ -487,7 +513,8 @@ class Sessions:
             self._view, topic, window, newest_first=True, copies=True, may_be_empty=True
         ):
             if session is None or self.may_hold(session, rows.recording):
-                yield self._pairs_in(rows, session if self.holds_carried(rows.recording) else None)
+                carried_of = session if self.holds_carried(rows.recording) else None
+                yield rows.recording, self._pairs_in(rows, carried_of)
 
     def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
         """Returns the pairs in rows, of a session or of all; remembers those of a part."""

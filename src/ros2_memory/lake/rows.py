@@ -200,15 +200,15 @@ class RowMaker:
 
     def _poses_by_file(self, bags: Collection[BagFile], window: TimeWindow) -> Mapping[str, Poses]:
         """Returns the robot's poses in each bag, by transforms where no topic has poses."""
-        view, body = self._view, self._body
-        if body is None:
+        view = self._view
+        if self._body is None:
             rows = scan(view, self._path_topic, window, copies=True)
             return poses_by_bag(view, rows, {bag.file for bag in bags})
         poses = {}
         for bag in bags:
             session = view.sessions.session_of(bag.recording)
             of_bag = TimeWindow(bag.start, bag.end + 1)
-            poses[bag.file] = sparse_poses_of_body(view, of_bag, session, body)
+            poses[bag.file] = sparse_poses_of_body(view, of_bag, session)
         return {file: of_bag for file, of_bag in poses.items() if len(of_bag)}
 
     def _rows_of_bag(

@@ -30,8 +30,7 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
-from ros2_memory.history.driven_path import driven_path, resolve_path_topic
-from ros2_memory.history.no_data import no_data_between
+from ros2_memory.history.driven_path import driven_path, no_path, resolve_path_topic
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.places.pose_frames import (
@@ -100,7 +99,7 @@ def driven_inside(
     name = resolve_path_topic(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None or not path.poses:
-        raise no_data_between(view, (name,), window)
+        raise no_path(view, name, window)
     note_unrecorded(view, window)
     track = known_track_for(view, place, window).track
     stays = stays_within(track, place.region, window)

@@ -93,9 +93,8 @@ def newest_pose(
     With a `recording` it is a message of its session, if that has the topic. None if there is no
     message, or if it cannot be decoded.
     """
-    body = body_of(view, topic)
-    if body is not None:
-        return newest_of_body(view, body, window, recording=recording)
+    if body_of(view, topic) is not None:
+        return newest_of_body(view, window, recording=recording)
     if recording is None:
         stored = view.stream.newest(topic, window)
     else:

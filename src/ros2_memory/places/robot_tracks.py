@@ -97,7 +97,8 @@ class TrackReader:
     def __init__(self, view: View, frame_id: str) -> None:
         self._view = view
         self._frame_id = frame_id
-        self._body = body = body_by_transforms(view)
+        body = body_by_transforms(view)
+        self._body = None if body is None else body.child
         self._topics = (view.pose_topic,) if body is None else view.limits.tf_topics
         self._own_frame = (
             frame_of_newest_pose(view, view.pose_topic) if body is None else body.child
@@ -394,7 +395,7 @@ class TrackReader:
                 placed.append(_placed_poses(span_poses, frames, self._frame_id))
             else:
                 edges = edges_of_rows(self._view, rows, session)
-                body_poses = placed_body(edges, self._body.child, frames, span)
+                body_poses = placed_body(edges, self._body, frames, span)
                 x, y, _ = body_poses.positions.T
                 placed.append(Placed(body_poses.times, x, y, headings(body_poses.turns), 0))
         return _in_time_order(placed)

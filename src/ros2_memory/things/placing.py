@@ -190,7 +190,7 @@ class Placer:
         if self.body is None:
             poses = self._recorded_poses(session, around)
         else:
-            poses = poses_by_session(self._view, around, lender, self.body)
+            poses = poses_by_session(self._view, around, lender)
         if not len(poses):
             return poses
         # Poses of one topic nearly always have one frame: those in other frames are left out.
