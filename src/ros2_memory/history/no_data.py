@@ -361,7 +361,8 @@ def no_data_at(
         reason = reason_beyond(view, at)
     else:
         reason = reason_between(view, window)
-        if around is None and reason is NoDataReason.GAP:
+        is_in_gap = bool(view.gaps(this_moment, around=True))
+        if around is None and reason is NoDataReason.GAP and not is_in_gap:
             reason, why = _reason_within_recording(view, older, newer)
     if (
         deleted

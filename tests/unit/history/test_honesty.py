@@ -495,6 +495,18 @@ def test_a_window_without_recording_is_not_answered_as_never(
     assert "the memory covers" in told["detail"]
 
 
+def test_a_moment_in_a_gap_is_not_between_messages_of_a_slow_topic(tmp_path: Path) -> None:
+    """Of the topic, which has a message a minute, none is missing; of the robot, 89 s are."""
+    for name, driven in (("a", range(301)), ("b", range(390, 700))):
+        messages = [odom(T0 + at * S, 0.1 * at) for at in driven]
+        messages += [text(T0 + at * S, "ok", "/slow") for at in driven if at % 60 == 0 or at == 391]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", sorted(messages, key=lambda m: m.log_time))
+    memory = memory_of(tmp_path)
+    for at, reason in ((350, "gap"), (270, "between_messages"), (395, "between_messages")):
+        told = asked(memory, "get_topic_at_time", topic="/slow", timestamp=T0_S + at)
+        assert (told["error"], told["reason"]) == ("no_data", reason)
+
+
 @pytest.mark.parametrize("tool", BEFORE)
 def test_never_before_the_memory_began_is_no_data(memory: Memory, tool: str) -> None:
     told = asked(memory, tool, **BEFORE[tool], before=T0_S - 1)
