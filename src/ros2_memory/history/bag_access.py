@@ -20,7 +20,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
-from ros2_memory.history.context import Call, Memory, Note, Notes, short_name
+from ros2_memory.history.context import Call, Memory, Note, Notes
 from ros2_memory.history.stored_message import StoredMessage
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class BagAccess:
         if window.overlaps(*lost):
             # All messages of a bag that contradicts itself were read.
             self.notes.complete &= kind is _CONTRADICTS_ITSELF
-            self.notes.add(Note(kind, short_name(bag.path), reason, *lost))
+            self.notes.add(Note(kind, bag.file, reason, *lost))
 
     def read(
         self,

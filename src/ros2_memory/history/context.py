@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 import time
+from collections import defaultdict
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol
 
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -29,7 +32,6 @@ from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from ros2_memory.analysis.frames import ClockOfTransforms
     from ros2_memory.bag_dir.heartbeat import Heartbeat
@@ -397,7 +399,7 @@ class Note(NamedTuple):
 
     Attributes:
         kind: the sentence.
-        file: the name of the file, topic or recording in replies.
+        file: the path of the bag, or the name of the topic or recording in replies.
         detail: what is special about it; may be empty.
         since: first log time that it concerns.
         until: last log time that it concerns (inclusive).
@@ -459,26 +461,27 @@ class Notes:
         not.
         """
         by_kind: dict[Reason, dict[str, str]] = {}
+        names = _names_of({note.file for note in self._notes if note.kind.noun == "bag"})
         for note in _farthest(self._notes):
             # Another sentence may have reported it already, from the summary of the bag.
             if note.detail not in self._remarks.get(note.file, ()):
-                by_kind.setdefault(note.kind, {})[note.file] = note.detail
+                name = names.get(note.file, note.file)
+                by_kind.setdefault(note.kind, {})[name] = note.detail
         shared = sorted(kind.sentence(files) for kind, files in by_kind.items())
         return (*shared, *self._sentences)
 
     def add_remarks(self, bags: Iterable[BagFile]) -> None:
         """Records that sentences have reported the remarks of these bags' summaries."""
-        self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
+        self._remarks |= {bag.file: bag.summary.remarks for bag in bags}
 
     def notes_cover_remarks(self, bag: BagFile) -> bool:
         """Returns whether the notes on a bag report all remarks of its summary.
 
         False if a sentence reported them (`add_remarks`): it replaces the notes.
         """
-        name = short_name(bag.path)
-        if name in self._remarks:
+        if bag.file in self._remarks:
             return False
-        own = [note for note in self._notes if note.file == name]
+        own = [note for note in self._notes if note.file == bag.file]
         details = {note.detail for note in _farthest(own)}
         return details.issuperset(bag.summary.remarks)
 
@@ -502,6 +505,18 @@ def _farthest(notes: Iterable[Note]) -> Iterable[Note]:
     """Returns one note for each kind and file: the one that reaches farthest."""
     ascending = sorted(notes, key=attrgetter("until", "since", "detail"))
     return {(note.kind, note.file): note for note in ascending}.values()
+
+
+def _names_of(files: Iterable[str]) -> dict[str, str]:
+    """Returns the names of bags by their paths: the `short_name`, unless several share it."""
+    by_name: dict[str, list[str]] = defaultdict(list)
+    for file in files:
+        by_name[short_name(Path(file))].append(file)
+    return {
+        file: name if len(alike) == 1 else os.path.relpath(file, os.path.commonpath(alike))
+        for name, alike in by_name.items()
+        for file in alike
+    }
 
 
 def short_name(path: Path) -> str:

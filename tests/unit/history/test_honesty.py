@@ -254,6 +254,19 @@ def test_many_topics_that_are_not_read_hide_no_damaged_file(tmp_path: Path, reca
     assert unread.startswith("1 bag file could not be read and may hold more: f/f_0.mcap")
 
 
+@each_way
+def test_damaged_bags_of_one_name_are_two(tmp_path: Path, recalls: bool) -> None:
+    for nth, robot in enumerate(("one", "two")):
+        seen = [odom(T0 + (100 * nth + n) * S, 0.1 * n) for n in range(40)]
+        path = tmp_path / robot / "run" / "run_0.mcap"
+        spoil_chunk(write_mcap(path, seen, McapLayout(chunk_size=2000)), 1)
+    memory = memory_of(tmp_path, recalls=recalls)
+    reply = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 140)
+    [damaged] = [note for note in reply["notes"] if "could not be read whole" in note]
+    assert damaged.startswith("2 bags could not be read whole: one/run/run_0.mcap (")
+    assert ", two/run/run_0.mcap (" in damaged
+
+
 @pytest.mark.parametrize("topics", [1, 3])
 def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
     tmp_path: Path, topics: int
