@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -58,7 +58,7 @@ class Block(NamedTuple):
     Attributes:
         first, last: no message is earlier or later.
         has_match: whether some message may meet the condition.
-        tested: tests the messages.
+        tested: tests the messages, once.
     """
 
     topic: str
@@ -119,7 +119,7 @@ class MatchTester:
         has_match = not truth.is_none
         self.ruled_out |= not has_match
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
-        tested = partial(self._test_rows, topic, rows, truth)
+        tested = cache(partial(self._test_rows, topic, rows, truth))
         return Block(topic, first, last, has_match=has_match, tested=tested)
 
     def _test_rows(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:

@@ -22,6 +22,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Match
 from ros2_memory.storage.mcap_reader import McapReader
@@ -299,6 +300,19 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
     reply = asked(memory_of(tmp_path), "find_matches", **wash)
     assert len(reply["sightings"]) == 4
     assert "may have held for longer" in str(reply["notes"])
+
+
+def test_of_recordings_that_overlap_each_message_is_tested_once(tmp_path: Path) -> None:
+    """A message that cannot be decoded leaves both without columns: all messages are read."""
+    for nth, name in enumerate(("one", "two")):
+        said = [text(T0 + n * NS_PER_S // 10 + nth, f"{n} of {name}") for n in range(300)]
+        said[7] = replace(said[7], body=b"\x00")
+        write_mcap(tmp_path / name / f"{name}_0.mcap", said)
+    memory, matches = memory_of(tmp_path), ReverseSearch.matches
+    never = {"topic": "/chatter", "condition_type": "contains", "value": "of nobody"}
+    with patch.object(ReverseSearch, "matches", autospec=True, side_effect=matches) as tested:
+        assert asked(memory, "find_matches", **never)["sightings"] == []
+    assert tested.call_count == 600
 
 
 def test_only_the_bag_of_the_match_is_read(filled: tuple[Memory, NotingReader]) -> None:
