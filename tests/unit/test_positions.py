@@ -10,6 +10,7 @@ import pytest
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
@@ -280,6 +281,18 @@ def test_transforms_that_do_not_place_the_body_are_named(tmp_path: Path) -> None
     assert reply["reason"] == "frame_unknown"
     assert "there are: hand, shoulder" in reply["detail"]
     assert left_out in reply["notes"]
+
+
+def test_what_was_read_as_time_ran_out_is_in_the_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three slices of five minutes the second is read as time runs out."""
+    begin = T0 - T0 % (300 * S)
+    memory = remembered(tmp_path, [odom(begin + n * S, 0.1 * n) for n in range(900)])
+    monkeypatch.setattr(Call, "partial_after", lambda *_: Deadline.after(0))
+    reply = asked(memory, "trajectory_summary", start=begin / S, end=begin / S + 900)
+    assert (reply["start"], reply["poses"]) == (begin / S + 300, 600)
+    assert f"the path is known back to {begin // S + 300}" in str(reply["notes"])
 
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:

@@ -206,10 +206,11 @@ def read_until_late(
     since = MAX_NS
     try:
         for at, value in newest_first:
-            if values and reading.expired():
-                return values, since
+            is_late = bool(values) and reading.expired()
             values.append(value)
             since = at
+            if is_late:
+                return values, since
     except QueryTimeoutError:
         if not values:
             raise
