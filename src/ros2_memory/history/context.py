@@ -454,6 +454,18 @@ class Notes:
         finally:
             self.complete = self.complete and before
 
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """Within the block, what is noted of files, and `complete`, is not of the answer.
+
+        Only `added` shows it afterwards.
+        """
+        complete, notes = self.complete, dict(self._notes)
+        try:
+            yield
+        finally:
+            self.complete, self._notes = complete, notes
+
     def sentences(self) -> tuple[str, ...]:
         """Returns the sentences for the reply: one for each kind of note, then all others.
 

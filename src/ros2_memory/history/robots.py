@@ -8,6 +8,7 @@ has different parents in them.
 from __future__ import annotations
 
 from collections import defaultdict
+from contextlib import suppress
 from itertools import chain, combinations, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -337,8 +338,8 @@ def _parallel_recordings(
     """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
-    noted_before = view.notes.so_far()
-    try:
+    # The answer itself does not need what is read here.
+    with view.notes.apart(), suppress(QueryTimeoutError, NotInLakeError):
         for parallel in islice(_overlapping_pairs(view, topic, window), most_pairs):
             pair = parallel.first, parallel.other
             # Several robots in one folder have thousands of pairs: each recording is enough once.
@@ -346,12 +347,8 @@ def _parallel_recordings(
             if not is_known and _differ(view, topic, pair, parallel.span.intersect(window)):
                 differing.append(parallel)
                 apart.update(() if parallel.by_clock else pair)
-    except (QueryTimeoutError, NotInLakeError):
-        return None
-    finally:
-        # The answer itself does not need what was read here.
-        view.notes.retract_outside(keep=noted_before)
-    return differing
+        return differing
+    return None
 
 
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:

@@ -9,11 +9,14 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import View
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, with_store
 
 S = 10**9
@@ -36,6 +39,17 @@ def mounted(parent: str, at: int = T0) -> Msg:
 
 
 MIXED = re.compile("as from several robots.*blue, red")
+
+
+def test_what_is_read_to_tell_robots_apart_says_nothing_of_the_answer(tmp_path: Path) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        path = tmp_path / robot / f"{robot}_0.mcap"
+        write_mcap(path, drive(10.0 * number), McapLayout(chunk_size=2000))
+    spoil_chunk(path, 0)
+    view = View(memory_of(tmp_path), Call())
+    assert robots.recordings_apart(view, ["/odom"], TimeWindow(T0, T0 + 60 * S)) is not None
+    assert view.notes.added
+    assert (view.notes.complete, view.notes.sentences()) == (True, ())
 
 
 @pytest.fixture(scope="module", params=["{0}/{0}_0", "{0}", "{0}_0"])
