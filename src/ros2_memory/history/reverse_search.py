@@ -207,25 +207,33 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     path = below or ".".join(view.extractor.fields_of(type_name).get(shown, (shown,)))
     _, _, name = path.rpartition(".")
     number_field = re.compile(_NUMBER_FIELD.format(re.escape(name)), re.MULTILINE)
-    for schema in _schemas_of(view, type_name):
-        text = _text_of(schema)
-        if number_field.search(text):
-            numbers = {number for constant, number in _CONSTANT.findall(text) if constant == word}
-            return int(numbers.pop()) if len(numbers) == 1 else value
-    return value
+    texts = [_text_of(schema) for schema in _schemas_of(view, type_name)]
+    numbers = {
+        number
+        for text in texts
+        if number_field.search(text)
+        for constant, number in _CONSTANT.findall(text)
+        if constant == word
+    }
+    return int(numbers.pop()) if len(numbers) == 1 else value
 
 
 def _schemas_of(view: View, type_name: str) -> list[Schema]:
-    """Returns the definitions of a type in the first file that has it; none if it is damaged."""
+    """Returns the definitions of a type in the first and the last file that have it.
+
+    They differ after an update of the robot. None are returned of a damaged file.
+    """
     timeline = view.timeline
     topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
     if topic is None:
         return []
-    try:
-        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
-    except BagError:
-        return []
-    return [channel.schema for channel in channels if channel.type == type_name]
+    schemas: list[Schema] = []
+    first, last = (find(topic, type_name) for find in (timeline.first_with, timeline.last_with))
+    for path in dict.fromkeys((first.path, last.path)):
+        with suppress(BagError):
+            channels = view.memory.reader.channels(path)
+            schemas += [channel.schema for channel in channels if channel.type == type_name]
+    return schemas
 
 
 def _text_of(schema: Schema) -> str:

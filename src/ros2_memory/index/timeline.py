@@ -317,15 +317,26 @@ class Timeline:
 
     def first_with(self, topic: str, type_name: str) -> BagFile:
         """Returns the first bag that holds the topic under a type; there must be one."""
-        segment = next(
-            segment for segment in self.segments if type_name in segment.types.get(topic, ())
-        )
-        holds_topic = segment.bags.with_schema(
-            lambda schema: any(
-                (header.topic, header.type) == (topic, type_name) for header in schema.topics
-            )
-        )
-        return segment.bags[int(holds_topic.argmax())]
+        return next(self._bags_with(topic, type_name, self.segments, nth=0))
+
+    def last_with(self, topic: str, type_name: str) -> BagFile:
+        """Returns the last bag that holds the topic under a type; there must be one."""
+        return next(self._bags_with(topic, type_name, reversed(self.segments), nth=-1))
+
+    @staticmethod
+    def _bags_with(
+        topic: str, type_name: str, segments: Iterable[Segment], *, nth: int
+    ) -> Iterator[BagFile]:
+        """Yields of each segment that has any the first or last bag with the topic under a type."""
+        for segment in segments:
+            if type_name in segment.types.get(topic, ()):
+                holds_topic = segment.bags.with_schema(
+                    lambda schema: any(
+                        (header.topic, header.type) == (topic, type_name)
+                        for header in schema.topics
+                    )
+                )
+                yield segment.bags[int(holds_topic.nonzero()[0][nth])]
 
 
 def _end_of_faults(bag: BagFile) -> Ns:

@@ -99,6 +99,29 @@ def test_a_constant_names_the_number_of_a_field_that_replies_call_otherwise(
     assert at(last(memory, "equals", "STATUS_GBAS_FIX", "/fix", field=field)) == 0
 
 
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_a_constant_may_be_of_the_first_or_of_the_last_definition_of_a_type(
+    tmp_path: Path, *, newest_first: bool
+) -> None:
+    plain, named = "uint8 fix\n", "uint8 FIX_NONE = 1\nuint8 FIX_RTK = 6\nuint8 fix\n"
+    definitions = [named, plain] if newest_first else [plain, named]
+    for day, definition in enumerate(definitions):
+
+        def fill(writer: Writer, day: int = day, definition: str = definition) -> None:
+            schema = writer.register_schema("gps_msgs/msg/Fix", "ros2msg", definition.encode())
+            channel = writer.register_channel("/fix", "cdr", schema)
+            for second, fix in enumerate([6, 1, 6]):
+                at = T0 + (1000 * day + second) * NS_PER_S
+                writer.add_message(channel, at, b"\0\1\0\0" + bytes([fix]), at)
+
+        raw_mcap(tmp_path / f"day_{day}" / f"day_{day}_0.mcap", fill, profile="ros2")
+    memory = memory_of(tmp_path)
+
+    assert at(last(memory, "equals", "FIX_NONE", "/fix", field="fix")) == 1001
+    with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
+        last(memory, "equals", "FIX_GONE", "/fix", field="fix")
+
+
 def test_a_constant_that_is_no_whole_number_is_not_taken_for_one(tmp_path: Path) -> None:
     body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
     memory = remembered(tmp_path, [Msg("/winch", "winch_msgs/msg/Winch", T0, body)])
