@@ -33,7 +33,7 @@ from ros2_memory.core.text import (
     still_quoted,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.context import Note
+from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.detections import hung_since
 from ros2_memory.history.no_data import matching_topics
@@ -44,6 +44,7 @@ from ros2_memory.history.reverse_search import (
     score_limit,
 )
 from ros2_memory.history.scan import scan
+from ros2_memory.history.view import View
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import plain, singular
@@ -180,7 +181,7 @@ def notes_on_never(
 
     `is_bounded`: the search did not count the matches at some times of the window.
     """
-    meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
+    meant = () if is_bounded else _found_otherwise_spelt(view, topic, condition, window)
     topics = matching_topics(view, topic)
     heights = position_frames(view, topics) if condition.field == "position.z" else ()
     frames = {frame for _, of_topic in heights for frame in of_topic}
@@ -192,29 +193,33 @@ def notes_on_never(
     )
 
 
-def _found_in_singular(
+def _found_otherwise_spelt(
     view: View, topic: str, condition: Condition, window: TimeWindow
 ) -> tuple[str, ...]:
-    """Returns the note on a text that was not found, if its singular without an article was.
+    """Returns the note on a text that was not found, if another spelling of it was.
 
-    A search takes a text as it stands, while `find_things` takes a label in either form.
+    A search takes a text as it stands, while `find_things` takes a label in any of these forms.
     """
     test = condition.test
     if not isinstance(test, Contains | Equals) or test.folded is None:
         return ()
-    text = plain(test.folded)
-    bare = _ARTICLE.sub("", text)
-    for word in dict.fromkeys((bare, singular(bare))):
-        if word == text:
-            continue
+    brief = View(view.memory, view.call.within(READING_S), view.reach)
+    for word in _other_spellings(test.folded):
         other = replace(test, needle=word) if isinstance(test, Contains) else Equals(word)
         with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
-            search = ReverseSearch(view, topic, replace(condition, test=other))
+            search = ReverseSearch(brief, topic, replace(condition, test=other))
             stored = search.newest(window.stop, window.start)
             if stored is not None:
                 said = f"{abbreviate(test.folded)} was not found, but {abbreviate(word)} was"
                 return (f"{said}, last at {unix_text(stored.time)}",)
     return ()
+
+
+def _other_spellings(text: str) -> list[str]:
+    """Returns a text without its article, then in the singular, with each spacing of labels."""
+    bare = _ARTICLE.sub("", plain(text))
+    words = [word.replace(" ", spacing) for spacing in " _-" for word in (bare, singular(bare))]
+    return [word for word in dict.fromkeys(words) if word != text]
 
 
 def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterator[str]:

@@ -67,6 +67,26 @@ def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> 
     assert found.notes == (note,)
 
 
+@pytest.mark.parametrize("asked", ["traffic light", "traffic-lights", "the Traffic Light"])
+@pytest.mark.parametrize("condition_type", ["equals", "contains", "contains_word"])
+def test_never_names_the_spelling_of_a_label_that_was_found(
+    tmp_path: Path, condition_type: str, asked: str
+) -> None:
+    memory = remembered(tmp_path, [detections(BEGIN, ["traffic_light"])])
+    note = f'"{asked.lower()}" was not found, but "traffic_light" was, last at {T0:.6f}'
+    found = find_matches(memory, Call(), OBJECTS, condition_type, asked)
+    assert found.total == 0
+    assert found.notes == (note,)
+    assert note in queries.find_last_match(memory, Call(), OBJECTS, condition_type, asked).notes
+
+
+def test_never_names_a_label_with_spaces_that_was_asked_for_without(tmp_path: Path) -> None:
+    memory = remembered(tmp_path, [detections(BEGIN, ["traffic light"])])
+    found = find_matches(memory, Call(), OBJECTS, "equals", "traffic_light")
+    note = f'"traffic_light" was not found, but "traffic light" was, last at {T0:.6f}'
+    assert found.notes == (note,)
+
+
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
     memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
