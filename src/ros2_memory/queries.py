@@ -35,6 +35,7 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     Ns,
     ns_from_unix,
+    unix_from_ns,
 )
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
@@ -124,6 +125,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.driven_path import Body
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
@@ -331,15 +333,41 @@ def _position_of_body(
 def _unplaced_error(view: View, at: Ns, tolerance: Ns | None, frame_id: str | None) -> NoDataError:
     """Returns why no transform places the robot's body at a moment."""
     body = body_at(view, at)
+    error = None
     try:
         if body is not None:
-            frame_history.transform_at(view, frame_id or body.parent, body.child, at)
-        error = no_data_at(view, view.moving_topics, at, tolerance)
+            parent = frame_id or body.parent
+            frame_history.transform_at(view, parent, body.child, at)
+            error = _too_old_error(view, body, parent, at, tolerance)
+        error = error or no_data_at(view, view.moving_topics, at, tolerance)
     except NoDataError as no_transform:
         error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), no_transform)
     fixes = topics_with(view, "geodetic")
     advice = f"; latitude and longitude are on {listed(fixes)}: give topic" if fixes else ""
     return NoDataError(error.reason, error.detail + advice, error.notes)
+
+
+def _too_old_error(
+    view: View, body: Body, parent: str, at: Ns, tolerance: Ns | None
+) -> NoDataError | None:
+    """Returns that the newest transform of the body is older than the tolerance, and how old.
+
+    None unless other frames have newer ones on these topics: else messages are lacking.
+    """
+    newest = newest_of_body(view, TimeWindow(at - TF_CACHE_NS, at + 1), parent)
+    within = TimeWindow(at if tolerance is None else at - tolerance, at + 1)
+    has_others = any(view.stream.newest(topic, within) for topic in view.moving_topics)
+    if newest is None or tolerance is None or not has_others:
+        return None
+    age = at - newest[0].time
+    enough = math.ceil(unix_from_ns(age) * 1000) / 1000
+    detail = (
+        f"no transform of {body.child!r} in {parent!r} within {seconds(tolerance)} before "
+        f"{unix_text(at)}; the nearest older one is {seconds(age)} before it, at "
+        f"{unix_text(newest[0].time)}; to accept it, ask with tolerance_s of at least {enough:.3f}"
+    )
+    error = NoDataError(NoDataReason.BETWEEN_MESSAGES, detail)
+    return with_notes(view, within, error)
 
 
 def velocity(

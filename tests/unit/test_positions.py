@@ -295,6 +295,24 @@ def test_what_was_read_as_time_ran_out_is_in_the_answer(
     assert f"the path is known back to {begin // S + 300}" in str(reply["notes"])
 
 
+def test_a_lost_transform_of_the_body_is_told_where_other_frames_have_newer_ones(
+    tmp_path: Path,
+) -> None:
+    turning = [
+        tf(at := T0 + n * S // 10 + S // 50, transform(at, "base_link", "gimbal", (0.1, 0.0, 0.0)))
+        for n in range(50)
+    ]
+    driven = [message for n, message in enumerate(moved(range(50))) if n != 30]
+    memory = remembered(tmp_path, sorted([*driven, *turning], key=lambda message: message.log_time))
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 3.03)
+    assert reply["reason"] == "between_messages"
+    assert "no transform of 'base_link' in 'map' within 0.1 s before" in reply["detail"]
+    assert "the nearest older one is 0.13 s before it" in reply["detail"]
+    assert "ask with tolerance_s of at least 0.130" in reply["detail"]
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 3.03, tolerance_s=0.13)
+    assert reply["timestamp"] == pytest.approx(T0_S + 2.9)
+
+
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
         tf(

@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.stored_message import StoredMessage
-    from ros2_memory.history.view import View
     from ros2_memory.things.instances import Move
     from ros2_memory.things.known import KnownThings
 
