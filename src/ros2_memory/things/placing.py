@@ -78,7 +78,7 @@ class PlacedSights(NamedTuple):
 
     Attributes:
         frame_id: of all places and poses: the map, or the frame of the robot's poses if no
-            transforms lead to the map.
+            transforms lead to the map from there, nor from what was seen.
         sights: the sights of each topic; sights without a topic have the fixes.
         detectors: the topics that surely have a detector.
     """
@@ -127,7 +127,8 @@ class Placer:
         if not messages_of_topics:
             return None
         poses = self._poses(session, lender, window)
-        target, frames = self._frames(lender, window, poses)
+        seen_in = _frames_of(messages_of_topics[topic] for topic in detectors)
+        target, frames = self._frames(lender, window, poses, seen_in)
         sights = [
             _sights_of(topic, messages, frames, _robot_at(poses, messages, frames))
             for topic, messages in messages_of_topics.items()
@@ -148,9 +149,14 @@ class Placer:
 
         See `place` for the arguments. These sights do not have the robot's poses.
         """
-        target, frames = self._frames(lender, window, self._poses(session, lender, window))
+        by_bag: dict[BagFile, dict[str, Detected]] = {}
+        seen_in: set[str] = set()
         for bag, units in units_of_bags.items():
-            messages_of_topics, _ = self._new_messages(units, window.start)
+            by_bag[bag], detectors = self._new_messages(units, window.start)
+            seen_in |= _frames_of(by_bag[bag][topic] for topic in detectors)
+        poses = self._poses(session, lender, window)
+        target, frames = self._frames(lender, window, poses, seen_in)
+        for bag, messages_of_topics in by_bag.items():
             for topic, messages in messages_of_topics.items():
                 if messages.found.rows.size:
                     nowhere = np.full((len(messages.log_times), 5), math.nan)
@@ -215,8 +221,14 @@ class Placer:
         except InvalidArgumentsError:  # the topic is of no poses
             return NO_POSES
 
-    def _frames(self, lender: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
-        """Returns the frame for sights (the map if transforms lead there), and the frames in it."""
+    def _frames(
+        self, lender: Session, window: TimeWindow, poses: Poses, seen_in: set[str]
+    ) -> tuple[str, FrameTree]:
+        """Returns the frame for sights, and the frames in it.
+
+        It is the map if transforms lead there from the robot's poses, or from what was seen alone.
+        `seen_in` has the frames of that.
+        """
         pose_frame = poses.frames.words[0] if len(poses) else ""
         target = self._view.limits.map_frame or pose_frame
         if not lender:
@@ -226,7 +238,11 @@ class Placer:
         is_map_reached = pose_frame and (pose_frame == target or frames.reaches(pose_frame))
         if not len(poses) or is_map_reached:
             return target, frames
-        return pose_frame, frames_over(self._view, lender, window, pose_frame)
+        by_poses = frames_over(self._view, lender, window, pose_frame)
+        is_by_poses = pose_frame in seen_in or any(map(by_poses.reaches, seen_in))
+        if any(map(frames.reaches, seen_in)) and not is_by_poses:
+            return target, frames
+        return pose_frame, by_poses
 
     def _fixes(self, session: Session, poses: Poses, frames: FrameTree, detected: Ints) -> Sights:
         """Returns how well it was known where the robot was around detections.
@@ -288,6 +304,14 @@ class Placer:
                     ends = -(-rows.times // _SAID_NS)
                     lasts = np.flatnonzero(np.diff(ends, append=MAX_NS))
                     yield from messages_of(self._view, rows.some(lasts))
+
+
+def _frames_of(detected: Iterable[Detected]) -> set[str]:
+    """Returns the frames of messages and of the detections in them."""
+    words: set[str] = set()
+    for messages in detected:
+        words.update(messages.frames.words, messages.found.frames.words)
+    return {word.lstrip("/") for word in words} - {""}
 
 
 def _fix_times(first: Ns, last: Ns) -> tuple[Ints, Ns]:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
+from operator import attrgetter
 from pathlib import Path
 from random import Random
 from typing import Any, TypeVar
@@ -24,9 +25,9 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known, unseen
 from ros2_memory.things.find import find_things
-from tests.support.bags import Msg, detected, odom, text, tf, transform, write_splits
+from tests.support.bags import Msg, detected, header, odom, text, tf, transform, write_splits
 from tests.support.clocks import in_zone
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -136,6 +137,30 @@ def test_things_of_a_robot_that_transforms_place_are_those_by_its_poses(
     assert replies[0][0]["total"] > 1
     assert replies[0][0]["frame_id"] == ("odom" if map_off is None else "map")
     assert replies[1] == replies[2] == replies[0]
+
+
+@each_way
+def test_things_are_in_the_map_also_where_no_transform_leads_there_from_the_robots_poses(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As of a drone whose autopilot has poses in NED, beside transforms of its computer."""
+    seen = [("cup", 3.0, 0.0), ("fork", 3.0, -1.0)]
+    messages = [*looked(0, 60, HERE, *seen), *looked(60, 120, AWAY)]
+    without_poses = [message for message in messages if message.topic != "/odom"]
+    in_ned = [
+        replace(message, body=replace(message.body, header=header(message.log_time, "NED")))
+        for message in messages
+        if message.topic == "/odom"
+    ]
+    write_splits(tmp_path / "without", without_poses)
+    write_splits(tmp_path / "ned", sorted([*without_poses, *in_ned], key=attrgetter("log_time")))
+    replies = [
+        asked(memory_of(tmp_path / name, recalls=recalls), "find_things")
+        for name in ("without", "ned")
+    ]
+    assert replies[0]["frame_id"] == "map"
+    assert replies[0]["total"] == 2
+    assert replies[1] == replies[0]
 
 
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
