@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
@@ -313,6 +313,29 @@ def test_a_lost_transform_of_the_body_is_told_where_other_frames_have_newer_ones
     assert reply["timestamp"] == pytest.approx(T0_S + 2.9)
 
 
+def test_poses_that_no_transform_connects_with_the_map_are_said_to_have_transforms_beside(
+    tmp_path: Path,
+) -> None:
+    messages = [*moved(range(90)), *(vehicle(T0 + n * S, n) for n in range(9))]
+    messages.sort(key=lambda message: message.log_time)
+    yard = Place("yard", "map", Rectangle(0, 3, -1, 1))
+    limits = QuerySettings(pose_topic=VEHICLE, places=(yard,))
+    memory = remembered(tmp_path, messages, limits=limits)
+    hint = "transforms place base_link there: data.pose_topic=/tf answers by them"
+    for tool, given in (
+        ("get_position_at", {"timestamp": T0_S + 1, "frame_id": "map"}),
+        ("trajectory_summary", {"start": T0_S, "end": T0_S + 5, "frame_id": "map"}),
+        ("visits", {"where": "yard"}),
+    ):
+        refused = asked(memory, tool, **given)
+        assert refused["error"] == "invalid_arguments"
+        assert refused["detail"].endswith(hint)
+    [note] = [note for note in asked(memory, "visits")["notes"] if "yard" in note]
+    assert note.endswith(hint)
+    by_transforms = remembered(tmp_path, messages, limits=replace(limits, pose_topic="/tf"))
+    assert asked(by_transforms, "visits", where="yard")["total"] == 1
+
+
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
         tf(
@@ -436,3 +459,5 @@ def test_of_several_topics_of_poses_the_refusal_says_which_is_best(tmp_path: Pat
         "(nav_msgs/msg/Odometry): set data.pose_topic to one of them (best to odometry that no "
         "localisation corrects), or give topic where the tool takes it"
     )
+    beside = asked(remembered(tmp_path, [*poses, *moved(range(5))]), "visits", x=1.0, y=0.0)
+    assert ", or to /tf to place the robot by transforms, or give topic" in beside["detail"]

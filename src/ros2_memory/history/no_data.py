@@ -167,6 +167,8 @@ def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None
     if topics:
         name, _, _ = topics[0].partition(" ")
         value = f"={name}" if len(topics) == 1 else f" to one of them{_BEST_POSES[what]}"
+        if what == "position" and len(topics) > 1 and view.moving_topics:
+            value += f", or to {view.moving_topics[0]} to place the robot by transforms"
         return f"; {those} are on {listed(topics)}: set data.pose_topic{value}, or {GIVE_TOPIC}"
     if what == "position" and (
         fixes := topics_with(view, "geodetic") or unmapped_topics_with(view, "geodetic")

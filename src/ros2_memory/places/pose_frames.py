@@ -41,6 +41,7 @@ from ros2_memory.history.driven_path import (
     is_odometry,
     newest_of_body,
     resolve_path_topic,
+    robot_body,
 )
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
@@ -188,8 +189,17 @@ def _require_connected(view: View, frame_id: str, own_frame: str) -> None:
     if not (own_frame and connects(view, (frame_id, own_frame))):
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-            f"{own_frame or 'a pose without a frame'}"
+            f"{own_frame or 'a pose without a frame'}{_body_there(view, frame_id, own_frame)}"
         )
+
+
+def _body_there(view: View, frame_id: str, own_frame: str) -> str:
+    """Returns a clause if transforms place the robot's body in a frame, unlike its poses."""
+    body = robot_body(view)
+    if body is None or own_frame == body.child or not connects(view, (frame_id, body.child)):
+        return ""
+    topic = view.moving_topics[0]
+    return f"; transforms place {body.child} there: data.pose_topic={topic} answers by them"
 
 
 def placed_waypoints(
@@ -321,7 +331,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)} (as asked, or of a place), and where the robot "
             f"was is known in {known_frames} only: ask in that frame, or make it the `frame` of "
-            "the place"
+            f"the place{_body_there(view, frame_id, frame)}"
         )
     return placement
 
@@ -452,6 +462,7 @@ def places_in(
             view.notes.add(
                 f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
                 f"known in {' and '.join(placement.frames)}"
+                f"{_body_there(view, place.frame_id, placement.pose_frame)}"
             )
     return tracks
 

@@ -147,11 +147,10 @@ def test_things_are_in_the_map_also_where_no_transform_leads_there_from_the_robo
     seen = [("cup", 3.0, 0.0), ("fork", 3.0, -1.0)]
     messages = [*looked(0, 60, HERE, *seen), *looked(60, 120, AWAY)]
     without_poses = [message for message in messages if message.topic != "/odom"]
-    in_ned = [
-        replace(message, body=replace(message.body, header=header(message.log_time, "NED")))
-        for message in messages
-        if message.topic == "/odom"
-    ]
+    in_ned = []
+    for pose in (message for message in messages if message.topic == "/odom"):
+        body: Any = pose.body
+        in_ned.append(replace(pose, body=replace(body, header=header(pose.log_time, "NED"))))
     write_splits(tmp_path / "without", without_poses)
     write_splits(tmp_path / "ned", sorted([*without_poses, *in_ned], key=attrgetter("log_time")))
     replies = [
