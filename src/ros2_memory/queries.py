@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
+from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.layout import is_thinned
@@ -82,6 +83,7 @@ from ros2_memory.history.reverse_search import (
     may_be_elsewhere,
     note_no_fix,
     out_of_time,
+    types_matching,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
 from ros2_memory.history.scan import pick
@@ -143,6 +145,10 @@ _REACH_M: Final = 0.05
 _THINNED_POSES_NS: Final = 3 * NS_PER_S
 """The longest time between two poses of a thinned day, while poses were recorded."""
 _ROUNDING_MPS: Final = 0.01
+_ENDED_GOALS: Final = (
+    "these messages list the numbers of statuses, of goals also for minutes after they ended: "
+    'find_matches, such as contains "aborted", finds each goal with when it ended'
+)
 
 
 def topic_value(
@@ -809,9 +815,13 @@ def _last_match_in(view: View, search: _Search) -> tuple[StoredMessage | None, t
     if search.until < MAX_NS:
         require_recorded(view, TimeWindow(MIN_NS, search.until))
     match = reverse_search.newest(search.until)
-    if match is not None:
-        return match, ()
-    return None, _notes_on_never(view, search, reverse_search)
+    if match is None:
+        notes = _notes_on_never(view, search, reverse_search)
+        lists_goals = GOALS in types_matching(view, search.topic)
+        return None, (_ENDED_GOALS, *notes) if lists_goals else notes
+    if match.type == GOALS:
+        view.notes.add(_ENDED_GOALS)
+    return match, ()
 
 
 def _notes_on_never(view: View, search: _Search, reverse_search: ReverseSearch) -> tuple[str, ...]:

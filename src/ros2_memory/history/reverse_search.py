@@ -23,7 +23,7 @@ from ros2_memory.analysis.conditions import (
     NearPosition,
     parse_condition,
 )
-from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE
+from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE, GOALS
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -108,9 +108,9 @@ def condition_of(
         NoDataError: no such topic is recorded.
         InvalidArgumentsError: it is no condition.
     """
-    limits, timeline = view.limits, view.timeline
+    limits = view.limits
     least = limits.min_score if min_score is None else min_score
-    types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
+    types = types_matching(view, pattern)
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
@@ -127,6 +127,12 @@ def condition_of(
         raise InvalidArgumentsError(f"{error}{hint}") from error
     _require_fraction(view, pattern, condition)
     return condition
+
+
+def types_matching(view: View, pattern: str) -> frozenset[str]:
+    """Returns the types of the topics that a name or glob matches."""
+    topics = matching_topics(view, pattern)
+    return frozenset(chain.from_iterable(map(view.timeline.types_of, topics)))
 
 
 def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
@@ -257,7 +263,8 @@ def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tu
     word = test.folded if isinstance(test, Contains | Equals) else None
     if condition.field or not word:
         return ()
-    types = sorted({*chain.from_iterable(map(view.timeline.types_of, topics))})
+    # The statuses of goals are searched by their words.
+    types = sorted({*chain.from_iterable(map(view.timeline.types_of, topics))} - {GOALS})
     named = {
         constant: type_name
         for type_name in types[:_MOST_TYPES]

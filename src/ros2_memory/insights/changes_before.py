@@ -28,6 +28,7 @@ from ros2_memory.analysis.facts import (
     has_changes,
     has_events,
 )
+from ros2_memory.analysis.goals import GOAL_WORDS
 from ros2_memory.analysis.topic_events import Change, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import Pose, TimeWindow
@@ -40,7 +41,6 @@ from ros2_memory.history.held_values import held_at, is_latched
 from ros2_memory.history.reverse_search import newest_above
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
-    GOAL_WORDS,
     action_of,
     events_in,
     events_of_messages,

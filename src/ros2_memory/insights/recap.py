@@ -14,6 +14,7 @@ from heapq import nsmallest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
+from ros2_memory.analysis.goals import FAILURES
 from ros2_memory.analysis.intervals import IntervalTable, united_tables
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
@@ -46,7 +47,6 @@ from ros2_memory.insights.changes_before import (
 from ros2_memory.insights.drive import Drive, Stop, drive_in
 from ros2_memory.insights.silences import group_silences, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import (
-    FAILURES,
     GoalRun,
     events_in,
     flags_before,

@@ -12,13 +12,13 @@ nothing of when the goal got that status.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
 from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.facts import FLAG, GOAL, GOALS, Stated, joined_stated, state_of, stated_by
+from ros2_memory.analysis.goals import ENDED, GOAL_WORDS, STATUS, STATUS_WORDS, statuses_matching
 from ros2_memory.analysis.topic_events import (
     Change,
     KnownState,
@@ -31,7 +31,6 @@ from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -272,12 +270,6 @@ def note_foxglove_logs(view: View, window: TimeWindow) -> None:
 
 
 STATUS_TOPIC: Final = "/_action/status"
-GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
-FAILURES: Final = frozenset({"canceled", "aborted"})
-_ENDED: Final = frozenset({4, 5, 6})
-_STATUS: Final = "status"
-_STATUS_WORDS: Final = {0: "unknown", 1: "accepted", 2: "executing", **GOAL_WORDS}
-_FAILED: Final = "failed"
 
 
 class GoalRun(NamedTuple):
@@ -314,7 +306,7 @@ class GoalRun(NamedTuple):
     @property
     def status_word(self) -> str:
         """The last status in a word."""
-        return _STATUS_WORDS.get(self.status, str(self.status))
+        return STATUS_WORDS.get(self.status, str(self.status))
 
 
 def action_of(topic: str) -> str:
@@ -396,14 +388,9 @@ def goals_matching(
     """
     types = {name for topic in topics for name in view.timeline.types_of(topic)}
     field = None if condition.field is None else condition.field.rsplit(".", 1)[-1]
-    if types != {GOALS} or field not in {None, _STATUS}:
+    if types != {GOALS} or field not in {None, STATUS}:
         return None
-    wanted = _statuses_matching(condition)
-    if not wanted:
-        raise InvalidArgumentsError(
-            f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
-            f"(0 to {max(_STATUS_WORDS)}), or {_FAILED}, which is canceled or aborted"
-        )
+    wanted = statuses_matching(topics[0], condition)
     goals = [goal for goal in _known_goals(view, topics, scope.window) if goal.status in wanted]
     goals.sort(key=lambda goal: (goal.last, goal.first, goal.goal), reverse=True)
     goals = [goal for goal in goals if scope.holds_at(goal.last)]
@@ -414,22 +401,6 @@ def goals_matching(
             "server listed no more: last is when it did"
         )
     return goals
-
-
-def _statuses_matching(condition: Condition) -> set[int]:
-    """Returns the statuses whose number or word meets a condition.
-
-    Canceled and aborted are also called failed.
-    """
-    on_status = replace(condition, field=_STATUS)
-    matching = set()
-    for number, word in _STATUS_WORDS.items():
-        names: list[JsonValue] = [number, word]
-        if word in FAILURES:
-            names.append(_FAILED)
-        if on_status.matches({_STATUS: names}):
-            matching.add(number)
-    return matching
 
 
 def _known_goals(view: View, topics: Sequence[str], window: TimeWindow) -> Iterator[GoalRun]:
@@ -459,7 +430,7 @@ def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
         return {}
     events = events_of_messages(view, [held])
     listed = [] if events is None else events.of_kind(GOAL)[0]
-    return {goal.name: goal.last for goal in listed if goal.last not in _ENDED}
+    return {goal.name: goal.last for goal in listed if goal.last not in ENDED}
 
 
 def _goal_runs(
@@ -473,13 +444,13 @@ def _goal_runs(
     ends: dict[str, tuple[Ns, int]] = {}
     goals, changes = events.of_kind(GOAL)
     for change in changes:
-        if change.value in _ENDED:
+        if change.value in ENDED:
             ends.setdefault(change.name, (change.time, change.value))
     for goal in goals:
         is_listed_first = goal.at == events.first
-        if statuses_before.get(goal.name) in _ENDED:
+        if statuses_before.get(goal.name) in ENDED:
             continue
-        if goal.first in _ENDED:
+        if goal.first in ENDED:
             if goal.name not in statuses_before and is_listed_first and not knows_all:
                 continue  # it may have ended long before
             ends[goal.name] = (goal.at, goal.first)

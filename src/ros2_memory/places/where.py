@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.conditions import as_float
+from ros2_memory.analysis.facts import GOALS
+from ros2_memory.analysis.goals import while_active
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -28,7 +30,12 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
-from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
+from ros2_memory.history.reverse_search import (
+    ReverseSearch,
+    compared_frames,
+    condition_of,
+    types_matching,
+)
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.history.tested_messages import MET, UNKNOWN, MatchTester, Tested
@@ -404,6 +411,8 @@ class _ConditionStates:
         self._view = view
         topic, kind, value = during.topic, during.condition_type, during.value
         condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
+        if types_matching(view, topic) == {GOALS}:
+            condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
         self._tester = MatchTester(view, self.search)
         self._holds_on = holds_on(view, self.search.topics)

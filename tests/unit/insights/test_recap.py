@@ -403,6 +403,51 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     assert held("executing", 900, 940) == ([], 0, 0, "None")
 
 
+def test_while_a_goal_was_executing_is_asked_by_that_word(tmp_path: Path) -> None:
+    """Executing from 10 to 20 s and from 30 to 35 s; the first one stays listed as succeeded."""
+    messages = [*history((5, {1: 1}), (10, {1: 2}), (20, {1: 4}), (30, {1: 4, 2: 2}), (35, {2: 6}))]
+    messages += [boolean(BEGIN + at * S, True, topic="/bump") for at in (7, 15, 25, 32, 38)]
+    messages.sort(key=lambda message: message.log_time)
+    memory = remembered(tmp_path, messages)
+
+    def bumps(kind: str, word: str, **more: object) -> Any:
+        during = {"topic": TOPIC, "condition_type": kind, "value": word} | more
+        question = {"topic": "/bump", "condition_type": "equals", "value": True, "while": during}
+        reply = asked(memory, "find_matches", **question, oldest_first=True)
+        if "error" in reply:
+            return reply["detail"]
+        return [row["first_seen"] - T0 for row in reply["sightings"]]
+
+    assert bumps("equals", "executing") == bumps("contains", "exec") == [15, 32]
+    assert bumps("contains_word", "accepted") == [7]
+    assert bumps("equals", 2, field="status_list.status") == [15, 32]
+    for word in ("aborted", "failed", "cancel"):
+        assert "find_matches says when each one ended" in bumps("contains", word)
+    assert "the status of a goal is unknown, accepted, executing" in bumps("contains", "driving")
+
+
+def test_a_search_for_messages_that_list_goals_says_that_they_list_those_that_ended(
+    tmp_path: Path,
+) -> None:
+    memory = remembered(tmp_path, history((10, {1: 2}), (20, {1: 6}), (30, {1: 6, 2: 2})))
+    number = {"condition_type": "equals", "field": "status_list.status", "value": 6}
+    word = {"condition_type": "contains", "value": "aborted"}
+    last = asked(memory, "find_last_match", topic=TOPIC, **number)
+    assert last["timestamp"] - T0 == 30
+    never = asked(memory, "find_last_match", topic=TOPIC, **word)
+    assert never["timestamp"] is None
+    both = {"value_topic": TOPIC, "condition_topic": TOPIC}
+    by_number, by_word = (
+        asked(memory, "get_value_when", **both, **each) for each in (number, word)
+    )
+    for reply in (last, never, by_number, by_word):
+        [note] = reply["notes"]
+        assert 'find_matches, such as contains "aborted", finds each goal' in note
+    assert [(goal, last) for goal, _, _, last in found_in(memory, "contains", "aborted")] == [
+        (1, 20)
+    ]
+
+
 def test_a_goal_has_the_fields_and_statuses_that_there_are(tmp_path: Path) -> None:
     memory = remembered(tmp_path, DAY)
     aborted = {"topic": TOPIC, "condition_type": "equals", "value": "aborted"}
