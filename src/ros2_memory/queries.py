@@ -167,9 +167,21 @@ def topic_value(
     view, at, now = open_moment(memory, call, moment)
     stored = _newest_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
     window, _ = _window_before(view, at, tolerance_s, moment.rest_s)
-    stored = newest_stating(view, stored, fields, window.start)
+    stating = newest_stating(view, stored, fields, window.start)
+    if stating is None:
+        view.notes.add(*_last_named(view, stored, fields))
+    stored = stating or stored
     value = _as_value(view, stored, fields, now)
     return _with_latched_age(view, value, stored, at)
+
+
+def _last_named(view: View, stored: StoredMessage, fields: Sequence[str]) -> tuple[str, ...]:
+    """Returns a note on when a message before `stored`, which names other joints, named these."""
+    stating = newest_stating(view, stored, fields, MIN_NS)
+    if stating is None:
+        return ()
+    asked = listed(fields)
+    return (f"{asked}: last at {unix_text(stating.time)}; a longer tolerance_s reaches it",)
 
 
 def topic_range(
@@ -188,8 +200,13 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    shown, failures = _show_messages(view, picked, fields)
+    stating = _Stating(view, fields, window.start)
+    shown, failures = _show_messages(view, stating.of(picked), fields)
     chosen = len(shown) + failures.total()
+    if stating.left_out and not chosen:
+        detail = f"the messages of {name} in this time say nothing of {listed(fields)}"
+        raise NoDataError(NoDataReason.BETWEEN_MESSAGES, detail)
+    chosen += stating.left_out
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -204,6 +221,8 @@ def topic_range(
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
     if chosen < total:
         view.notes.add(f"{chosen} of {total} samples, evenly spaced over the window")
+    if stating.left_out:
+        view.notes.add(f"{stating.left_out} samples left out: they say nothing of the fields")
     note_unread(view, window, gaps=chosen < total)
     note_edges(view, window)
     note_robots(view, name, window)
@@ -215,6 +234,28 @@ def topic_range(
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
+
+
+class _Stating:
+    """Messages that say something of fields, in place of those that name other joints.
+
+    Attributes:
+        left_out: how many messages have none between the message before and themselves.
+    """
+
+    def __init__(self, view: View, fields: Sequence[str], start: Ns) -> None:
+        self.left_out = 0
+        self._view, self._fields, self._since = view, fields, start
+
+    def of(self, messages: Iterable[StoredMessage]) -> Iterator[StoredMessage]:
+        """Yields for each message the newest one that says something; messages are in order."""
+        for message in messages:
+            stating = newest_stating(self._view, message, self._fields, self._since)
+            self._since = message.time + 1
+            if stating is None:
+                self.left_out += 1
+            else:
+                yield stating
 
 
 def position(
@@ -511,7 +552,7 @@ def _value_at_match(
         days.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
         notes = (*matched.notes, *days.notes.sentences())
         return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
-    stored = newest_stating(view, stored, fields, MIN_NS)
+    stored = newest_stating(view, stored, fields, MIN_NS) or stored
     since_value = replace(until_match, start=stored.time)
     for shown_days in dict.fromkeys((days, view)):
         note_unread(shown_days, since_value)

@@ -401,11 +401,11 @@ def is_text(view: View, topic: str) -> bool:
 
 def newest_stating(
     view: View, stored: StoredMessage, fields: Sequence[str], since: Ns
-) -> StoredMessage:
+) -> StoredMessage | None:
     """Returns the newest message from a log time up to `stored` that says something of a field.
 
     `stored` itself, unless it names other joints than the fields do: several nodes may publish
-    those of one robot.
+    those of one robot. None if all of these messages name others.
     """
     if not fields or _says_something(view, stored, fields):
         return stored
@@ -415,7 +415,7 @@ def newest_stating(
         is_alike = earlier.bag.recording == stored.bag.recording
         if is_alike and _says_something(view, earlier, fields):
             return earlier
-    return stored
+    return None
 
 
 def _says_something(view: View, stored: StoredMessage, fields: Sequence[str]) -> bool:

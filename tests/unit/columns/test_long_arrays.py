@@ -109,20 +109,20 @@ def arm(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:
 def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
     tmp_path: Path, made: Callable[[int, Sequence[str], Sequence[float]], Msg], count: int
 ) -> None:
-    kind, random, bent = f"acme_msgs/msg/Arm{count}", Random(count), list[float]()
+    kind, random = f"acme_msgs/msg/Arm{count}", Random(count)
+    bent, stated = list[float](), list[float]()
     typestore().register(get_types_from_msg(f"string[] names\nfloat64[{count}] positions\n", kind))
     joints, messages = ["elbow", "gripper.left", *map("joint_{}".format, range(count - 1))], []
-    elbows: list[float | None] = []
     for nth in range(40):
         # Where one is missing, another node publishes it.
         names = random.sample(joints[1:] if nth % 4 == 3 or nth == 39 else joints, count)
         angles = {name: random.random() for name in names}
         messages.append(made(nth, names, [*angles.values()]))
-        elbows.append(angles.get("elbow"))
+        if "elbow" in angles:
+            stated.append(angles["elbow"])
         if angles.get("elbow", 0.0) > 0.5:
             bent.append(T0 / NS_PER_S + nth)
     plain = remembered(tmp_path, messages)
-    stated = [angle for angle in elbows if angle is not None]
     states = [is_bent for is_bent, _ in groupby(angle > 0.5 for angle in stated)]
     window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
     elbow = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
@@ -135,7 +135,7 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
         assert len(runs) == states.count(True)
         of_elbow = partial(ask, name="get_topic_in_range", fields=["positions.elbow"], **window)
         shown = [angle for _, angle in of_elbow(max_samples=40)["rows"]]
-        assert shown == pytest.approx(elbows, abs=1e-6)
+        assert shown == pytest.approx(stated, abs=1e-6)
         of_hour = of_elbow(by="hour")
         ends = dict(zip(of_hour["columns"][1:], of_hour["all"], strict=True))
         assert ends["positions.elbow.min"] == pytest.approx(min(stated), abs=1e-6)
@@ -196,6 +196,8 @@ def test_a_joint_holds_its_value_while_another_publisher_names_others(
     for tolerance_s, lifted in ((2.0, 0.5), (0.5, None)):  # beyond it nothing says it
         at_time = asked(memory, "get_topic_at_time", **then, tolerance_s=tolerance_s)
         assert at_time["value"] == {"positions.lift": lifted}
+        note = f"positions.lift: last at {T0 / NS_PER_S + 6:.6f}; a longer tolerance_s reaches it"
+        assert at_time.get("notes", []) == ([] if lifted else [note])
     bent = {"condition_type": "above", "field": "positions.elbow", "value": 0.3}
     topics = {"condition_topic": "/joints", "value_topic": "/joints"}
     found = asked(memory, "get_value_when", **topics, **bent, fields=["positions.lift"])
@@ -203,6 +205,29 @@ def test_a_joint_holds_its_value_while_another_publisher_names_others(
         {"positions.lift": 0.5},
         T0 / NS_PER_S + 10,
     )
+
+
+def test_samples_of_a_joint_are_messages_that_name_it(tmp_path: Path) -> None:
+    messages = list[Msg]()
+    for nth in range(0, 40, 2):
+        messages += [joint_state(nth, ["lift"], [nth / 10]), joint_state(nth + 1, ["elbow"], [0.0])]
+    messages += [joint_state(40 + nth, ["elbow"], [0.0]) for nth in range(10)]
+    plain = remembered(tmp_path, messages)
+    begin = T0 / NS_PER_S
+    for memory in (plain, with_store(plain, tmp_path)):
+        samples = partial(asked, memory, "get_topic_in_range", topic="/joints")
+        lift = partial(samples, fields=["positions.lift"])
+        few = lift(start=begin, end=begin + 39, max_samples=3)
+        assert few["rows"] == [[begin, 0], [begin + 18, 1.8], [begin + 38, 3.8]]
+        assert few["notes"][0] == "3 of 40 samples, evenly spaced over the window"
+        every = lift(start=begin + 10, end=begin + 15)
+        assert [row[1] for row in every["rows"]] == [1, 1.2, 1.4]
+        assert every["notes"] == ["3 samples left out: they say nothing of the fields"]
+        both = samples(fields=["positions.lift", "positions.elbow"], start=begin, end=begin + 1)
+        assert [row[1:] for row in both["rows"]] == [[0, None], [None, 0]]
+        none = lift(start=begin + 41, end=begin + 45)
+        assert (none["error"], none["reason"]) == ("no_data", "between_messages")
+        assert none["detail"].endswith("in this time say nothing of positions.lift")
 
 
 def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path) -> None:
