@@ -85,7 +85,11 @@ from ros2_memory.history.reverse_search import (
     out_of_time,
     types_matching,
 )
-from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
+from ros2_memory.history.robots import (
+    note_robots,
+    note_robots_near,
+    require_one_robot,
+)
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import (
     AtTime,

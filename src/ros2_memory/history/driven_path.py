@@ -40,13 +40,12 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
-    no_data_between,
     resolve_pose_topic,
     undecodable,
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows
-from ros2_memory.history.robots import parallel_or_twice
+from ros2_memory.history.robots import no_poses_between, parallel_or_twice
 from ros2_memory.history.scan import (
     blocks,
     joined_back,
@@ -556,12 +555,12 @@ def no_path(view: View, topic: str, window: TimeWindow) -> NoDataError:
         newest = view.stream.first(view.moving_topics, window, newest_first=True)
     body = None if newest is None else body_at(view, newest.time)
     if newest is None or body is None:
-        return no_data_between(view, (topic,), window)
+        return no_poses_between(view, topic, window)
     try:
         transform_at(view, body.odometry, body.child, newest.time, newest.bag.recording)
     except NoDataError as error:
         return with_notes(view, window, error)
-    return no_data_between(view, (topic,), window)
+    return no_poses_between(view, topic, window)
 
 
 def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:

@@ -47,7 +47,7 @@ from ros2_memory.history.driven_path import (
     slices_of_path,
 )
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.robots import require_one_robot
+from ros2_memory.history.robots import parallel_or_twice, require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS, with_runs
 
 if TYPE_CHECKING:
@@ -152,7 +152,9 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed)
     if path is None:
-        view.notes.add(f"{topic} has no poses in this time: the path is unknown")
+        is_twice = any(pair.is_twice for pair in parallel_or_twice(view, topic, window))
+        which = " that count" if is_twice else ""
+        view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown")
         return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
     known = reached(view.snapshot, TimeWindow(begin, window.stop))

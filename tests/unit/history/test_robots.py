@@ -221,6 +221,26 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
         assert len(whole["waypoints"]) == 4
 
 
+@each_way
+def test_of_a_file_that_has_a_time_twice_no_path_is_known_and_no_pose_is_said_to_be_missing(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As of a simulation that is reset while its clock gives the log times."""
+    write_mcap(tmp_path / "run" / "run_0.mcap", [*driving(0, 100, 0.0), *driving(0, 60, 0.0)])
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"start": T0_S, "end": T0_S + 90}
+    for asks in ({}, {"by": "hour"}, {"where": PLACE}):
+        refused = asked(memory, "trajectory_summary", **window, **asks)
+        assert (refused["error"], refused["reason"]) == ("no_data", "mixed"), asks
+        assert refused["detail"].startswith("run has the time from")
+        assert "which poses belong to one path is not known" in refused["detail"]
+    recapped = asked(memory, "recap", **window)
+    assert recapped["distance_m"] is None
+    note = "/odom has no poses in this time that count: the path is unknown"
+    assert note in recapped["notes"]
+    assert asked(memory, "get_topic_in_range", topic="/odom", **window)["total"] > 100
+
+
 @pytest.mark.parametrize(
     "other",
     [
