@@ -142,15 +142,14 @@ class Snapshot:
 
     @cached_property
     def _periods(self) -> dict[str, Ns]:
-        """The usual period of each topic that has one; logs have none."""
+        """The usual period of each topic that has one; logs and calls have none."""
         by_topic: dict[str, list[Pacing]] = {}
         for segment in self.whole_segments:
             for topic, pacing in segment.pacings.items():
                 by_topic.setdefault(topic, []).append(pacing)
-        is_log = self.timeline.is_log
-        return usual_periods(
-            {topic: joined_pacings(parts) for topic, parts in by_topic.items() if not is_log(topic)}
-        )
+        for topic in filter(self.timeline.is_on_events, [*by_topic]):
+            del by_topic[topic]
+        return usual_periods({topic: joined_pacings(parts) for topic, parts in by_topic.items()})
 
     @cached_property
     def _runs(self) -> dict[str, Spans]:

@@ -47,6 +47,8 @@ MAX_FILE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """The longest time that a file is taken to hold if only one end of it is known."""
 SEGMENT_BAGS: Final = 1024
 """The most bags in a segment: it is computed in some milliseconds, and a week has 60 segments."""
+_ACTION: Final = "/_action/"
+_SERVICE_EVENT: Final = "/_service_event"
 
 
 class Timeline:
@@ -249,6 +251,13 @@ class Timeline:
     def is_log(self, topic: str) -> bool:
         """Returns whether the topic is a log, whose lines come when something happens."""
         return all(map(is_log, self.types_of(topic)))
+
+    def is_on_events(self, topic: str) -> bool:
+        """Returns whether the messages come when something happens: of logs and of calls.
+
+        Calls are actions and services, whose topics are hidden.
+        """
+        return self.is_log(topic) or _ACTION in topic or topic.endswith(_SERVICE_EVENT)
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns the pace of a topic in a recording, which must hold the topic."""

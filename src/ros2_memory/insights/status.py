@@ -302,7 +302,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     if latest is None or begin is None:
         return
     for topic in snapshot.timeline.topics():
-        if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
+        if snapshot.timeline.is_on_events(topic) or latching.is_latched(snapshot, topic):
             continue
         parts = snapshot.totals(topic)
         messages = sum(totals.messages for totals in parts)

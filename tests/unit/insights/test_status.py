@@ -23,6 +23,7 @@ from tests.support.bags import (
     Msg,
     boolean,
     detections,
+    goals,
     log_entry,
     odom,
     write_mcap,
@@ -32,7 +33,7 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, remembered
 
 S = 10**9
 T0 = 1_784_000_000
@@ -175,6 +176,22 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     reply = shown(memory)
     assert (reply["recorder"], reply["recorder_alive"]) == told
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
+
+
+def test_an_action_that_nobody_calls_is_not_silent(tmp_path: Path) -> None:
+    """Its topics have messages while a goal is active, as a log while there is something to log."""
+    messages = [odom(BEGIN + t * S) for t in range(600)]
+    called = [t for t in range(600) if t < 200 or 300 <= t < 350]
+    messages += [goals(BEGIN + t * S + 1, {1: 2}) for t in called]
+    messages += [boolean(BEGIN + t * S + 2, True, topic="/drive/_action/feedback") for t in called]
+    messages += [boolean(BEGIN + t * S + 3, True, topic="/bumper") for t in called]
+    messages += [boolean(BEGIN + t * S + 4, True, topic="/arm/_service_event") for t in called]
+    messages.sort(key=lambda message: message.log_time)
+    memory = remembered(tmp_path, messages)
+    status = asked(memory, "memory_status")
+    assert [row["topic"] for row in status["fell_silent"]] == ["/bumper"]
+    assert {row["topic"] for row in status["silences"]} == {"/bumper"}
+    assert len(status["silences"]) == 2
 
 
 @pytest.mark.parametrize(("later", "fell"), [(0, ["/bumper"]), (S, [])])
