@@ -29,6 +29,8 @@ def server() -> int:
 def _load(module: str, name: str) -> Callable[[], int]:
     """Imports the main function of a program; Ctrl-C meanwhile ends the process by its signal."""
     _open_closed_streams()
+    # Where the caller ignores it the system reaps children, and their exit codes are lost.
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     # In background jobs of a shell the signal is ignored, and stays so.
     is_ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_ours:

@@ -314,6 +314,25 @@ def test_a_start_that_is_refused_clears_nothing_and_leaves_no_lock(site: Site, c
     site.run().stop()
 
 
+def test_where_sigchld_is_ignored_a_ros2_that_cannot_record_is_noticed(site: Site) -> None:
+    """Shells and supervisors that ignore it hand that on to what they start."""
+    old = site.old_bag()
+    ros2 = site.folder / "bin" / "ros2"
+    ros2.write_text("#!/bin/sh\necho 'package ros2bag not found' >&2\nexit 1\n")
+    begin = "import sys; from ros2_memory import programs; sys.exit(programs.recorder())"
+    given = [*site.settings, "recording.clear_on_startup=true", "retention.foreign=delete"]
+    done = subprocess.run(
+        ["env", "--ignore-signal=CHLD", sys.executable, "-c", begin, *given],
+        env=site.env,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert (done.returncode, "package ros2bag not found" in done.stderr) == (1, True)
+    assert old.read_bytes() == b"old"
+
+
 def test_a_bag_directory_that_cannot_be_made_or_that_ros2_cannot_take_is_named(site: Site) -> None:
     site.bag_dir.write_text("a file")
     odd = quoted(os.fsdecode(os.fsencode(site.folder) + b"/S\xfcd"))

@@ -204,17 +204,13 @@ def _ending_signals() -> Iterator[list[int]]:
     """Yields a list that receives the numbers of ending signals; they interrupt nothing.
 
     sigwait(3) does not do: a thread that a library started earlier would receive the signals, and
-    they would end the program. SIGCHLD must not be ignored, or the system would reap children, and
-    other processes could take their numbers.
+    they would end the program.
     """
     received: list[int] = []
     with ExitStack() as restore:
         for number in ENDING_SIGNALS:
             before = signal.signal(number, lambda number, _frame: received.append(number))
             restore.callback(signal.signal, number, before)
-        restore.callback(
-            signal.signal, signal.SIGCHLD, signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        )
         yield received
 
 

@@ -31,6 +31,8 @@ MAX_LINE: Final = 4096
 """Characters of one line that are kept."""
 MAX_LINES: Final = 10_000
 """Lines that wait to be taken; of more, the oldest are dropped."""
+UNKNOWN_STATUS: Final = 255
+"""The exit status of a child that the system reaped, as it does where SIGCHLD is ignored."""
 
 _READER_PATIENCE_S: Final = 1.0
 _POLL_S: Final = 0.02
@@ -115,6 +117,7 @@ class Child:
         """Returns None while it runs, then its exit code, or minus the number of a signal.
 
         The rest of its group is killed first. `take_lines` then returns all its output.
+        `UNKNOWN_STATUS` stands for a child that was reaped elsewhere.
         """
         if self._status is not None:
             return self._status
@@ -123,7 +126,8 @@ class Child:
                 return None
             self._signal_group(signal.SIGKILL)
         except ChildProcessError:
-            pass  # already reaped: the number may belong to another process by now
+            # Already reaped: the number may belong to another process by now.
+            self._process.returncode = UNKNOWN_STATUS
         self._status = self._process.wait()
         self._reader.join(_READER_PATIENCE_S)
         return self._status
