@@ -387,7 +387,7 @@ def complete(bag_dir: Path) -> StoredMoment:
     """The one moment that is kept, when nothing of it is waited for any more."""
 
     def is_complete() -> StoredMoment | None:
-        [held] = stored_moments_in(bag_dir)
+        [held] = stored_moments_in(bag_dir).readable.values()
         return None if held.moment.pending else held
 
     return until(is_complete)
@@ -474,7 +474,7 @@ def test_rules_save_moments_over_a_rotation_and_a_kill(site: Site) -> None:
     following.wait_for("trigger_fired", rule="restarted")
 
     def complete() -> bool:
-        moments = [held.moment for held in stored_moments_in(site.bag_dir)]
+        moments = [held.moment for held in stored_moments_in(site.bag_dir).readable.values()]
         return {each.rule for each in moments if not each.pending} == {"said", "restarted"}
 
     until(complete)

@@ -52,7 +52,7 @@ def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: P
         recorder.wait_for("rotated", 1)
 
         def complete() -> list[StoredMoment] | None:
-            found = [*stored_moments_in(recorder.bag_dir)]
+            found = [*stored_moments_in(recorder.bag_dir).readable.values()]
             waits = len(found) < 3 or any(each.moment.pending for each in found)
             return None if waits else found
 

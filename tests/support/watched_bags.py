@@ -160,7 +160,7 @@ class WatchedBags:
         return state.rules[name]
 
     def moments(self) -> list[StoredMoment]:
-        found = [*stored_moments_in(self.bag_dir)]
+        found = [*stored_moments_in(self.bag_dir).readable.values()]
         return sorted(found, key=lambda each: each.moment.request.start)
 
     def spans(self) -> list[tuple[float, float]]:

@@ -171,6 +171,21 @@ class StoredMoment(NamedTuple):
     files: Mapping[int, int]
 
 
+class UnreadableMoment(NamedTuple):
+    """A folder whose `moment.json` cannot be read, and why; `files` as in a `StoredMoment`."""
+
+    folder: Path
+    problem: str
+    files: Mapping[int, int]
+
+
+class StoredMoments(NamedTuple):
+    """The saved moments by the names of their folders, sorted; and those that cannot be read."""
+
+    readable: dict[str, StoredMoment]
+    unreadable: dict[str, UnreadableMoment]
+
+
 def folder_name(request: SaveRequest) -> str:
     """Returns the name of a moment's folder: the time of the request (UTC) and its label."""
     ascii_label = unicodedata.normalize("NFKD", request.label).encode("ascii", "ignore").decode()
@@ -219,29 +234,42 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
-    """Returns the moment of a folder; None if it has no valid `moment.json`."""
-    with suppress(OSError, ValueError):
-        return parsed(_MOMENT, read_small_file(folder / MOMENT_FILE), FORMAT)
-    return None
+    """Returns the moment of a folder; None if it has no `moment.json`.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is damaged.
+    """
+    try:
+        text = read_small_file(folder / MOMENT_FILE)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return parsed(_MOMENT, text, FORMAT)
 
 
-def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
-    """Yields the saved moments, sorted by the names of their folders.
+def stored_moments_in(bag_dir: Path) -> StoredMoments:
+    """Returns the saved moments.
 
     Raises:
         OSError: the folder of the moments cannot be listed.
     """
+    stored = StoredMoments({}, {})
     moments = bag_dir / MOMENTS_FOLDER
-    if moments.is_symlink():
-        return
     try:
-        folders = sorted(moments.iterdir())
+        folders = [] if moments.is_symlink() else sorted(moments.iterdir())
     except (FileNotFoundError, NotADirectoryError):
-        return
+        return stored
     for folder in folders:
-        moment = None if folder.is_symlink() else read_saved_moment(folder)
-        if moment is not None:
-            yield StoredMoment(folder, moment, _bag_sizes(folder))
+        try:
+            moment = None if folder.is_symlink() else read_saved_moment(folder)
+        except (OSError, ValueError) as error:
+            problem = (error.strerror if isinstance(error, OSError) else None) or str(error)
+            unreadable = UnreadableMoment(folder, problem, _bag_sizes(folder))
+            stored.unreadable[folder.name] = unreadable
+        else:
+            if moment is not None:
+                stored.readable[folder.name] = StoredMoment(folder, moment, _bag_sizes(folder))
+    return stored
 
 
 def _bag_sizes(folder: Path) -> dict[int, int]:

@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, TRIGGERS_FILE
-from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, StoredMoment, stored_moments_in
+from ros2_memory.bag_dir.moment_file import (
+    Outcome,
+    PendingRequest,
+    StoredMoments,
+    stored_moments_in,
+)
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.view import View
 from ros2_memory.results import FiredRule, MomentList, RememberedMoment, ShownMoment
@@ -83,10 +88,12 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
 
     Raises:
         InvalidArgumentsError: there is no moment of this name.
-        RefusedError: the moments cannot be read.
+        RefusedError: the moments, or this one, cannot be read.
     """
     with _refuse_unreadable():
-        moments = {moment.folder.name: moment for moment in _moments_of(memory)}
+        moments, unreadable = _moments_of(memory)
+    if name in unreadable:
+        raise RefusedError(f"its moment.json cannot be read: {unreadable[name].problem}")
     if name not in moments:
         near = get_close_matches(name, moments, n=3, cutoff=0.3)
         hint = f"do you mean {' or '.join(near)}?" if near else f"{len(moments)} moments are saved"
@@ -101,11 +108,22 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
         RefusedError: the moments cannot be read.
     """
     with _refuse_unreadable():
-        stored = _moments_of(memory)
+        moments, unreadable = _moments_of(memory)
     with _refuse_unreadable(TRIGGERS_FILE):
         rules = fired_rules(memory.index.bag_dir)
-    stored.sort(key=lambda saved: (saved.moment.request.end, saved.folder.name), reverse=True)
-    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
+    newest = sorted(
+        moments.values(),
+        key=lambda saved: (saved.moment.request.end, saved.folder.name),
+        reverse=True,
+    )
+    notes = []
+    if unreadable:
+        problems = listed([*dict.fromkeys(moment.problem for moment in unreadable.values())])
+        notes.append(
+            f"{counted(len(unreadable), 'folder')} in {MOMENTS_FOLDER}/ without a readable "
+            f"moment.json: {listed([*unreadable])} ({problems})"
+        )
+    return MomentList(tuple(newest[:at_most]), len(newest[at_most:]), now, rules, tuple(notes))
 
 
 @contextmanager
@@ -120,16 +138,21 @@ def _refuse_unreadable(name: str = f"{MOMENTS_FOLDER}/") -> Iterator[None]:
         ) from error
 
 
-def _moments_of(memory: Memory) -> list[StoredMoment]:
+def _moments_of(memory: Memory) -> StoredMoments:
     """Returns the saved moments; if one recording alone answers, the moments with bags of it."""
-    recording = memory.limits.recording
-    return [
-        moment
-        for moment in stored_moments_in(memory.index.bag_dir)
-        if not recording
-        or Path(recording).is_relative_to(Path(MOMENTS_FOLDER, moment.folder.name))
-        or (moment.folder / recording).is_dir()
-    ]
+    recording, bag_dir = memory.limits.recording, memory.index.bag_dir
+    stored = stored_moments_in(bag_dir)
+    if not recording:
+        return stored
+
+    def has_bags(name: str) -> bool:
+        moment = Path(MOMENTS_FOLDER, name)
+        return Path(recording).is_relative_to(moment) or (bag_dir / moment / recording).is_dir()
+
+    return StoredMoments(
+        {name: moment for name, moment in stored.readable.items() if has_bags(name)},
+        {name: moment for name, moment in stored.unreadable.items() if has_bags(name)},
+    )
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:

@@ -82,6 +82,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
+        for note in moments.notes:
+            view.notes.add(note)
     except RefusedError as error:
         view.notes.add(str(error))
     return Status(

@@ -255,6 +255,7 @@ class MomentList:
     more: int
     now: Ns
     rules: tuple[FiredRule, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def oldest(self) -> Ns | None:

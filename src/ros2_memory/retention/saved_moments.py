@@ -27,6 +27,7 @@ from ros2_memory.bag_dir.moment_file import (
     SavedMoment,
     SaveRequest,
     StoredMoment,
+    StoredMoments,
     make_moment_folder,
     stored_moments_in,
     write_saved_moment,
@@ -179,7 +180,7 @@ class MomentKeeper:
         """Starts with nothing known."""
         self._queue = RequestQueue(self.bag_dir)
         self._links = HardLinks(self.bag_dir)
-        self._refused: set[Path] = set()  # moments of which the disk refused a link
+        self._faulty: set[Path] = set()  # moments that cannot be read, or of which no link is made
         # Until the first call of `keep` shows that nothing is pending.
         self._waiting = True
 
@@ -197,23 +198,25 @@ class MomentKeeper:
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        now, stored = self.clock.now(), self._read_moments()
-        for name, moment in stored.items():
+        now, stored = self.clock.now(), stored_moments_in(self.bag_dir)
+        for unreadable in stored.unreadable.values():
+            self._report(unreadable.folder, unreadable.problem)
+        for name, moment in stored.readable.items():
             if moment.moment.pending:
-                stored[name] = self._continue_moment(moment, stored, snapshot)
+                stored.readable[name] = self._continue_moment(moment, stored, snapshot)
         for request in self._queue.take(now) if self._queue.has_requests() else ():
             self._queue.answer(request.number, self._answer_to(request, stored, snapshot))
-        self._waiting = any(moment.moment.pending for moment in stored.values())
+        self._waiting = any(moment.moment.pending for moment in stored.readable.values())
 
     def _answer_to(
-        self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
+        self, request: SaveRequest, stored: StoredMoments, snapshot: Snapshot
     ) -> Outcome:
         """Returns the outcome of a request. A new moment begins, and is added to `stored`."""
         try:
             moment = _moment_of(request, stored)
             if moment is None:
                 moment = self._begin_moment(SavedMoment(request), stored, snapshot)
-                stored[moment.folder.name] = moment
+                stored.readable[moment.folder.name] = moment
         except _MomentRefusedError as error:
             refused = str(error)
         except OSError as error:
@@ -234,7 +237,7 @@ class MomentKeeper:
         Raises:
             OSError: it cannot be stored; the same request may be made again.
         """
-        stored = self._read_moments()
+        stored = stored_moments_in(self.bag_dir)
         wanted = SavedMoment(request, rule=rule, matches=matches)
         known = _moment_of(request, stored)
         if known is None:
@@ -267,12 +270,8 @@ class MomentKeeper:
             except OSError as error:
                 _log.error("moment_not_followed", path=root, reason=str(error))
 
-    def _read_moments(self) -> dict[str, StoredMoment]:
-        """Returns the moments by the names of their folders."""
-        return {moment.folder.name: moment for moment in stored_moments_in(self.bag_dir)}
-
     def _begin_moment(
-        self, wanted: SavedMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
+        self, wanted: SavedMoment, stored: StoredMoments, snapshot: Snapshot
     ) -> StoredMoment:
         """Begins a moment beside the `stored` ones.
 
@@ -302,7 +301,7 @@ class MomentKeeper:
         self,
         wanted: SavedMoment,
         need: NeededBags,
-        stored: Mapping[str, StoredMoment],
+        stored: StoredMoments,
         snapshot: Snapshot,
     ) -> Share:
         """Returns the share that a new moment belongs to.
@@ -331,7 +330,7 @@ class MomentKeeper:
         return share
 
     def _continue_moment(
-        self, before: StoredMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
+        self, before: StoredMoment, stored: StoredMoments, snapshot: Snapshot
     ) -> StoredMoment:
         """Continues a pending moment; its file lists what cannot be kept.
 
@@ -344,16 +343,14 @@ class MomentKeeper:
         except OSError as error:
             reason = error.strerror or str(error)
             if abs(self.clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
-                if before.folder not in self._refused:
-                    _log.error("moment_not_followed", path=str(before.folder), reason=reason)
-                self._refused.add(before.folder)
+                self._report(before.folder, reason)
                 return before
             links = _Links([f"not all can be saved: {reason}"])
         if not need.waits:
             names = (os.path.relpath(path, self.bag_dir) for path in need.open_files)
             links.missing += [f"{name} was still being written, or held back" for name in names]
         after = _with_links(before, need, links)
-        self._refused.discard(before.folder)
+        self._faulty.discard(before.folder)
         if after.moment != before.moment:
             try:
                 write_saved_moment(after.folder, after.moment)
@@ -365,19 +362,33 @@ class MomentKeeper:
                 _log.info("moment_complete", folder=after.folder.name, missing=missing)
         return after
 
-    def _group(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> list[StoredMoment]:
-        """Returns the moments that share a limit with one: of its rule, or of no known rule."""
+    def _report(self, folder: Path, reason: str) -> None:
+        """Logs the fault of a moment once."""
+        if folder not in self._faulty:
+            _log.error("moment_not_followed", path=str(folder), reason=reason)
+            self._faulty.add(folder)
+
+    def _group(self, moment: SavedMoment, stored: StoredMoments) -> list[Mapping[int, int]]:
+        """Returns the files of each moment that shares a limit with one.
+
+        These are the moments of its rule, or of no known rule, as those that cannot be read.
+        """
         rule = self._rule_of(moment)
-        return [other for other in stored.values() if self._rule_of(other.moment) == rule]
+        files = [
+            other.files for other in stored.readable.values() if self._rule_of(other.moment) == rule
+        ]
+        if rule is None:
+            files += [unreadable.files for unreadable in stored.unreadable.values()]
+        return files
 
     def _rule_of(self, moment: SavedMoment) -> str | None:
         return moment.rule if moment.rule in self.rule_bytes else None
 
-    def _share_of(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> Share:
+    def _share_of(self, moment: SavedMoment, stored: StoredMoments) -> Share:
         """Returns the share of a moment, with the files of the stored moments that use it."""
         files: dict[int, int] = {}
-        for other in self._group(moment, stored):
-            files.update(other.files)
+        for of_one in self._group(moment, stored):
+            files.update(of_one)
         rule = self._rule_of(moment)
         if rule is not None:
             return Share(self.rule_bytes[rule], f"max_gb of the rule {rule}", files)
@@ -461,9 +472,9 @@ def _missing_sentence(name: str) -> str:
     return f"{name} is missing, or another file has its name"
 
 
-def _moment_of(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
+def _moment_of(request: SaveRequest, stored: StoredMoments) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    for moment in stored.values():
+    for moment in stored.readable.values():
         if moment.moment.request.number == request.number:
             return moment
     return None

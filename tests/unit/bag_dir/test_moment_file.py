@@ -91,11 +91,11 @@ def test_what_is_written_is_read(
         json.dumps({**request().to_json(), "end_ns": 4, "pending": False, "missing": []}),
     ],
 )
-def test_what_says_something_else_is_no_moment(tmp_path: Path, text: str) -> None:
+def test_a_moment_whose_file_says_something_else_cannot_be_read(tmp_path: Path, text: str) -> None:
     folder = make_moment_folder(tmp_path, request())
     (folder / MOMENT_FILE).write_text(text)
-    assert read_saved_moment(folder) is None
-    assert list(stored_moments_in(tmp_path)) == []
+    stored = stored_moments_in(tmp_path)
+    assert ([*stored.readable], [*stored.unreadable]) == ([], [folder.name])
 
 
 def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
+from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     PendingRequest,
     SavedMoment,
@@ -26,6 +26,7 @@ from ros2_memory.insights import saved_moments
 from ros2_memory.insights.saved_moments import (
     list_moments,
     remember_moment,
+    show_moment,
 )
 from ros2_memory.results import RememberedMoment
 from ros2_memory.retention.policy import RetentionLimits
@@ -210,6 +211,22 @@ def test_the_file_that_keeps_moments_from_being_listed_is_named(
     monkeypatch.setattr(type(TRIGGERS), "read", refused)
     with pytest.raises(RefusedError, match=r"be allowed to read \.episodic/triggers\.json of"):
         list_moments(memory_of(tmp_path), Call())
+
+
+def test_a_moment_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    keep(tmp_path, 1)
+    keep(tmp_path, 2)
+    damaged, whole = sorted((tmp_path / MOMENTS_FOLDER).iterdir())
+    (damaged / MOMENT_FILE).write_text("{")
+    (tmp_path / MOMENTS_FOLDER / "no moment").mkdir()
+    memory = memory_of(tmp_path)
+    listed = shown(memory)
+    assert [moment["moment"] for moment in listed["moments"]] == [whole.name]
+    [note] = listed["notes"]
+    assert f"1 folder in moments/ without a readable moment.json: {damaged.name} (Exp" in note
+    assert note in asked(memory, "memory_status")["notes"]
+    with pytest.raises(RefusedError, match=r"^its moment\.json cannot be read: Expecting"):
+        show_moment(memory, Call(), damaged.name)
 
 
 def test_a_file_in_the_place_of_the_folder_holds_no_moment(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_what_cannot_be_kept_is_refused_with_the_reason_and_leaves_nothing(tmp_p
     # A bag that two moments share counts once in the share.
     assert [kept(house, tmp_path, *span).bags for span in ((0, 15), (5, 25))] == [2, 3]
     assert "retention.max_moments_gb" in refusal(25, 35)
-    assert len(list(stored_moments_in(tmp_path))) == 2
+    assert len(stored_moments_in(tmp_path).readable) == 2
     # Behind a link moments are neither made nor followed.
     (tmp_path / "moments").rename(tmp_path.parent / "else")
     (tmp_path / "moments").symlink_to(tmp_path.parent / "else")
@@ -249,7 +249,26 @@ def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_complete
     reported = told_of(tmp_path)
     assert (reported["pending"], reported["missing"]) == (False, [])
     assert outcome.bags == len(in_moments(tmp_path)) >= 2
-    assert len(list(stored_moments_in(tmp_path))) == 1
+    assert len(stored_moments_in(tmp_path).readable) == 1
+
+
+@pytest.mark.parametrize("is_damaged", [True, False])
+def test_a_moment_that_cannot_be_read_is_reported_once_and_keeps_its_part_of_the_share(
+    tmp_path: Path, is_damaged: bool
+) -> None:
+    made = recording(tmp_path, A, 0)
+    house = house_of(tmp_path, moments_bytes=5 * made[0].stat().st_size // 2)
+    assert kept(house, tmp_path, 19, 20).bags == 2
+    [path] = (tmp_path / "moments").glob(f"*/{MOMENT_FILE}")
+    if is_damaged:
+        path.write_text("{")
+    else:
+        path.unlink()
+        path.symlink_to(path)  # OSError: too many levels of symbolic links
+    with capture_logs() as captured:
+        refused = [str(kept(house, tmp_path, 1, 8).refused) for _ in range(2)]
+    assert all("retention.max_moments_gb" in reason for reason in refused)
+    assert [each["path"] for each in events(captured, "moment_not_followed")] == [str(path.parent)]
 
 
 def test_a_moment_that_cannot_be_written_holds_up_no_other(tmp_path: Path) -> None:

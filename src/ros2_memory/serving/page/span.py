@@ -434,10 +434,12 @@ def _events(memory: Memory, call: Call, window: TimeWindow) -> Part:
 def _moments(memory: Memory, call: Call) -> Part:
     """Returns the saved moments."""
     try:
-        stored = list_moments(memory, call).moments
+        stored = list_moments(memory, call)
     except EpisodicError as error:
         return Part({"moments": []}, (str(error),))
-    return Part({"moments": [_MOMENT.render(saved, Scope()) for saved in stored]})
+    return Part(
+        {"moments": [_MOMENT.render(saved, Scope()) for saved in stored.moments]}, stored.notes
+    )
 
 
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Part:
