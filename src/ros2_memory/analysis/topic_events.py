@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
 
-MAX_PER_BAG: Final = 64
-"""How many intervals, changes and errors of a topic in a bag a lake has; the rest is counted."""
 MAX_EVENTS: Final = 20_000
 """How many states, changes, errors or reports of a topic a question may have in memory."""
 MAX_INTERVALS: Final = 100_000

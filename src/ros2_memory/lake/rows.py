@@ -33,7 +33,7 @@ from ros2_memory.analysis.motion.robot_track import (
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEvents
+from ros2_memory.analysis.topic_events import TopicEvents
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -427,23 +427,21 @@ class RowMaker:
                 continue
             may_be_seen = any(map(may_have_detections, types))
             tables = scan(self._view, topic, window, copies=True)
-            for file, all_events in events_by_bag(self._view, tables, files).items():
-                events = all_events.limited(MAX_PER_BAG, MAX_PER_BAG)
+            for file, events in events_by_bag(self._view, tables, files).items():
                 rows_by_file[file] += self._events_of(topic, events)
                 # A topic whose events show no detections is not decoded.
-                if may_be_seen and (events.visible.size or events.left_out):
+                if may_be_seen and events.visible.size:
                     files_by_topic[topic].add(file)
         return rows_by_file, files_by_topic
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():
-            columns = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
-            yield _event(topic, "thing", seen.first, seen.label, **columns)
+            thing = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
+            yield _event(topic, "thing", seen.first, seen.label, **thing)
         _, flips = events.of_kind(FLAG)
         for flip in flips:
-            yield _event(
-                topic, "flip", flip.time, toggle_sentence(topic, flip), value=float(flip.value)
-            )
+            text, value = toggle_sentence(topic, flip), float(flip.value)
+            yield _event(topic, "flip", flip.time, text, value=value)
         for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)

@@ -39,7 +39,7 @@ from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
-from tests.support.bags import detections, text, write_mcap
+from tests.support.bags import Msg, detections, make, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import LONG
 from tests.support.fakes import failing
@@ -156,6 +156,19 @@ def test_a_thing_has_the_name_by_which_people_ask_for_it(tmp_path: Path) -> None
     ship_from(tmp_path)
     things = {row["thing"] for row in lake_rows(tmp_path / "lake", "sightings")}
     assert things == {"scissors", "safety goggles", "cup"}
+
+
+def test_each_event_of_a_bag_has_a_row(tmp_path: Path) -> None:
+    bag_dir, kind = tmp_path / "hall", "std_msgs/msg/Bool"
+    write_bag(bag_dir, 0)
+    states = [
+        Msg("/door", kind, START_S * NS_PER_S + number * 10**8, make(kind, data=bool(number % 2)))
+        for number in range(200)
+    ]
+    write_mcap(bag_dir / "rec" / "rec_1.mcap", states)
+    ship_from(tmp_path)
+    flips = [row for row in lake_rows(tmp_path / "lake", "events") if row["kind"] == "flip"]
+    assert sorted(row["first_ns"] for row in flips) == [state.log_time for state in states[1:]]
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
