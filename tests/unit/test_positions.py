@@ -336,6 +336,22 @@ def test_poses_that_no_transform_connects_with_the_map_are_said_to_have_transfor
     assert asked(by_transforms, "visits", where="yard")["total"] == 1
 
 
+@pytest.mark.parametrize("body", ["body", "base", "spot/body"])
+def test_a_frame_that_the_map_corrects_is_not_the_body(tmp_path: Path, body: str) -> None:
+    messages = [
+        tf(
+            at := T0 + n * S // 10,
+            transform(at, "map", "vision", (1.0, 0.0, 0.0)),
+            transform(at, "vision", body, (n / 10, 0.0, 0.0)),
+            transform(at, body, "odom", (-n / 10, 0.0, 0.0)),
+        )
+        for n in range(100)
+    ]
+    memory = remembered(tmp_path, messages)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 5, topic="/tf")
+    assert (reply["x"], reply["notes"]) == (6.0, [f"by transforms, of {body}"])
+
+
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
         tf(

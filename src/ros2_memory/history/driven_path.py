@@ -76,7 +76,7 @@ T = TypeVar("T", bound="Sized")
 
 _MOST_TRIED: Final = 1000
 """How many of the newest messages are tried until one can be decoded, or places the robot."""
-_BODIES: Final = ("base_footprint", "base_link")
+_BODIES: Final = ("base_footprint", "base_link", "base", "body")
 """Names of the frame of the robot's body, the likelier first."""
 _LONGEST_H: Final = 64
 """In a bag that spans more hours a clock was set: decades may lie between two messages."""
@@ -409,8 +409,8 @@ def _newest_body(view: View) -> Body | None:
 def _body_of_edges(view: View, edges: Sequence[FrameEdge], child: str | None = None) -> Body | None:
     """Returns the body with a frame by some pairs of frames; None if they do not move it.
 
-    Without a `child` it is found by its name (`base_footprint`, `base_link`), else it is the moving
-    frame that is nearest to the root.
+    Without a `child` it is found by its name (`_BODIES`), else it is the moving frame that is
+    nearest to the root.
     """
     # If a frame is static in one parent and moves in another, the latter counts.
     static_first = sorted(edges, key=attrgetter("static"), reverse=True)
