@@ -33,7 +33,6 @@ from ros2_memory.analysis.motion.robot_track import (
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.analysis.topic_events import TopicEvents
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.analysis.sights import Sights
+    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.detections import Detected
     from ros2_memory.storage.base import Batch, Channel, IntArray
