@@ -18,6 +18,7 @@ from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, U
 from ros2_memory.core.arrays import Columns, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
+    NoDataError,
     NotInLakeError,
     QueryTimeoutError,
     UndecodableError,
@@ -36,6 +37,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.detections import hung_since
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -241,6 +243,17 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
         yield from unplaced_notes(known, (question.window,))
         yield from _low_score_notes(known, question)
     yield from _notes_on_labels(known, question)
+    yield from _unknown_path_note(view, known, question.window)
+
+
+def _unknown_path_note(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
+    """Yields why nothing places the robot, if there are detections that could not be placed."""
+    if not _rows_during(window, known.estimate.unplaced, Unplaced.FIRST, Unplaced.LAST).size:
+        return
+    try:
+        resolve_path_topic(view)
+    except (InvalidArgumentsError, NoDataError) as error:
+        yield f"where the robot was is not known: {error}"
 
 
 def _low_score_notes(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:

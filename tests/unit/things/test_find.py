@@ -162,6 +162,24 @@ def test_things_are_in_the_map_also_where_no_transform_leads_there_from_the_robo
     assert replies[1] == replies[0]
 
 
+def test_where_the_robots_poses_are_to_be_chosen_unplaced_detections_say_so(tmp_path: Path) -> None:
+    """Two topics have poses, and none of them is `data.pose_topic`."""
+    messages = looked(0, 30, HERE, ("cup", 3.0, 0.0))
+    places = [message for message in messages if message.topic == "/odom"]
+    detections = [message for message in messages if message.topic.startswith("/vision")]
+    renamed = [replace(message, topic=to) for message in places for to in ("/odometry", "/pose")]
+    reply = told_of(tmp_path, [*detections, *renamed], label="cup")
+    assert reply["notes"] == [
+        "30 detections of it could not be placed, and are left out",
+        (
+            "where the robot was is not known: data.pose_topic is /odom, which these bags do not "
+            "have; poses are on /odometry (nav_msgs/msg/Odometry), /pose (nav_msgs/msg/Odometry): "
+            "set data.pose_topic to one of them (best to odometry that no localisation corrects), "
+            "or give topic where the tool takes it"
+        ),
+    ]
+
+
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
     for name, robot in (("wren", HERE), ("robin", (5.0, 0.0, 0.0))):
         seen = looked(0, 60, robot, ("cup", 3.0, 0.0))
