@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import at_field
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.columns.shown import words_of
@@ -159,11 +160,25 @@ class HeldValues:
                 raise InvalidArgumentsError(f"{asked}: {sentence}")
         if newest is not None and isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
+            advice = self._advice_on_element(newest) or (
+                "ask about a topic that has one, such as std_msgs/msg/String, or name one of its "
+                "fields where the tool takes fields"
+            )
             raise InvalidArgumentsError(
                 f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "
-                "boolean, which holds until the next one: ask about a topic that has one, such "
-                "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
+                f"boolean, which holds until the next one: {advice}"
             )
+
+    def _advice_on_element(self, stored: StoredMessage) -> str:
+        """Returns which single value to ask for if the field leads through a list; else nothing."""
+        value = self._view.with_examples(self._view.value(stored), stored)
+        path = [] if self._field is None else self._field.split(".")
+        for nth in range(1, len(path) + 1):
+            of_first = ".".join((*path[:nth], "0", *path[nth:]))
+            found = at_field(value, of_first)
+            if len(found) == 1 and not isinstance(found[0], list | dict | None):
+                return f"ask about one element of the list, such as {of_first}"
+        return ""
 
     def back(self, until: Ns) -> Iterator[HeldValue]:
         """Yields the values that began before a moment, newest first.

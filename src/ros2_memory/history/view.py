@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.examples import with_elements
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
@@ -129,6 +130,16 @@ class View:
         """Returns a message as JSON; None if it cannot be decoded."""
         message = self.bags.decode(stored)
         return None if message is None else self.extractor.exact(message, stored.type)
+
+    def with_examples(self, value: JsonValue, stored: StoredMessage) -> JsonValue:
+        """Returns a message's whole value with an example in each empty list of messages.
+
+        So it has all fields that its type can have.
+        """
+        if self.extractor.is_mapped(stored.type):
+            return value
+        definition = self.bags.memory.reader.definition(stored.record.channel)
+        return value if definition is None else with_elements(value, definition)
 
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
         """Returns the first and last log times of a topic in each bag of a window, or near it."""

@@ -53,7 +53,8 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         except UndecodableError as error:
             failure = error.reason
             continue
-        fields = dict(fields_of(memory.extractor.exact(message, type_name)))
+        value = memory.extractor.exact(message, type_name)
+        fields = dict(fields_of(view.with_examples(value, newest)))
         if len(fields) > MAX_FIELDS:
             view.notes.add(f"{MAX_FIELDS} of {len(fields)} fields")
         shown = tuple(fields.items())[:MAX_FIELDS]

@@ -23,6 +23,7 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.insights.fields import describe_type
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Match
 from ros2_memory.storage.mcap_reader import McapReader
@@ -35,6 +36,7 @@ from tests.support.bags import (
     header,
     make,
     odom,
+    stamp,
     text,
     write_mcap,
 )
@@ -199,6 +201,49 @@ def test_a_field_of_json_is_refused_with_what_to_ask_instead(tmp_path: Path) -> 
         "and min_score leaves out detections"
     )
     assert asked(memory, "find_matches", topic="/said", **given)["detail"].endswith("are: value")
+
+
+def statistics(second: int, *data: float) -> Msg:
+    """A message of a list that is mostly empty, as of faults."""
+    kind, at = "statistics_msgs/msg/MetricsMessage", T0 + second * NS_PER_S
+    points = [
+        make("statistics_msgs/msg/StatisticDataPoint", data_type=1, data=value) for value in data
+    ]
+    body = make(
+        kind,
+        measurement_source_name="node",
+        metrics_source="age",
+        unit="ms",
+        window_start=stamp(at),
+        window_stop=stamp(at),
+        statistics=points,
+    )
+    return Msg("/statistics", kind, at, body)
+
+
+def test_a_refusal_names_the_fields_of_what_a_list_has_that_is_empty_now(tmp_path: Path) -> None:
+    memory = remembered(tmp_path, [statistics(second) for second in range(9)])
+    given = {"topic": "/statistics", "condition_type": "above", "value": 0}
+    for field in ("data", "statistics.size"):
+        refused = asked(memory, "find_matches", field=field, **given)
+        assert refused["detail"].endswith(
+            f"the values have no field '{field}'; their fields are: measurement_source_name, "
+            "metrics_source, unit, window_start, window_stop, statistics, statistics.data_type, "
+            "statistics.data"
+        )
+    assert asked(memory, "find_matches", field="statistics.data", **given)["total"] == 0
+    described = describe_type(memory, Call(), "statistics_msgs/msg/MetricsMessage").fields
+    assert ("statistics.data", "number") in described
+
+
+@pytest.mark.parametrize("points", [(), (7.0,), (7.0, 8.0)])
+def test_a_value_in_a_list_is_refused_with_one_of_its_elements(
+    tmp_path: Path, points: tuple[float, ...]
+) -> None:
+    memory = remembered(tmp_path, [statistics(0, *points)])
+    window = {"topic": "/statistics", "start": T0_S, "end": T0_S + 9, "changes": True}
+    refused = asked(memory, "get_topic_in_range", fields=["statistics.data"], **window)["detail"]
+    assert refused.endswith("ask about one element of the list, such as statistics.0.data")
 
 
 def test_percent_of_humidity_that_is_stated_as_a_fraction_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,56 @@
+"""What elements of an empty list have: a message without faults shows which fields a fault has."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.messages.conversions import ANGLES, ValueKind, kind_of_type
+from ros2_memory.storage.base import Definition
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.model import JsonObject, JsonValue
+
+_MOST_FIELDS: Final = 1000
+"""Nested types of a few lines can have more fields than fit into memory."""
+
+
+def with_elements(value: JsonValue, definition: Definition) -> JsonValue:
+    """Returns a whole message, as conditions see it, with an element in each empty list.
+
+    Such an element is an example: it has the fields of its type, not their values.
+    """
+    return _filled(value, definition, iter(range(_MOST_FIELDS)))
+
+
+def _filled(value: JsonValue, definition: Definition, budget: Iterator[int]) -> JsonValue:
+    if not isinstance(value, dict):
+        return value
+    filled = dict(value)
+    for name, kind, length in definition.fields:
+        inner = value.get(name)
+        if not isinstance(kind, Definition):
+            continue
+        if length is None:
+            filled[name] = _filled(inner, kind, budget)
+        elif isinstance(inner, list):
+            first = _filled(inner[0], kind, budget) if inner else _example(kind, budget)
+            filled[name] = [first, *inner[1:]]
+    return filled
+
+
+def _example(kind: str | Definition, budget: Iterator[int]) -> JsonValue:
+    """Returns a value of a type, as conditions see it."""
+    if not isinstance(kind, Definition):
+        return "" if kind in {"string", "wstring"} else False if kind == "bool" else 0
+    shown = kind_of_type(kind.type, [field.name for field in kind.fields])
+    if shown is ValueKind.TIME:
+        return 0
+    if shown is ValueKind.QUATERNION:
+        return dict.fromkeys(ANGLES, 0)
+    example: JsonObject = {}
+    for (name, inner, length), _ in zip(kind.fields, budget, strict=False):
+        element = _example(inner, budget)
+        example[name] = element if length is None else [element]
+    return example
