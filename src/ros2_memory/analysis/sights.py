@@ -46,7 +46,8 @@ CELL_DECIDEG: Final = 100
 NO_YAW: Final = -1
 STOREY_MM: Final = 2_000
 """Two points that differ so much in height are on different floors."""
-_CELL: Final = (CELL_MM, CELL_MM, STOREY_MM, CELL_DECIDEG, CELL_DECIDEG)
+_UPRIGHT: Final = 3
+"""How far up is along z of what carries a detector that does not lean, in thirds."""
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05; scores above 1 are in the last bin."""
 SLICE_NS: Final = 10 * NS_PER_S
@@ -80,11 +81,12 @@ Spot = IntEnum("Spot", "SLICE TOPIC LABEL N X Y Z DEV FIRST LAST BEST TOGETHER",
 `TOGETHER` is how many of the label at least three messages had at once, or all had.
 """
 
-Look = IntEnum("Look", "SLICE TOPIC X Y YAW PAN N FIRST LAST Z", start=0)
+Look = IntEnum("Look", "SLICE TOPIC X Y YAW PAN N FIRST LAST Z LEAN", start=0)
 """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
 
 Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`. `PAN` is
-how far the detector was turned from the robot's heading, to `CELL_DECIDEG`.
+how far the detector was turned from the robot's heading, to `CELL_DECIDEG`; `LEAN` a number for
+how it was tilted or rolled, to some 20 degrees: 0 if it was upright.
 """
 
 Hit = IntEnum("Hit", "SPOT LOOK N", start=0)
@@ -118,8 +120,9 @@ class DetectorMessages(NamedTuple):
 
     Attributes:
         times: for each message, its log time (ns).
-        robot: for each message, x, y, z (m) and yaw (rad) of the robot, and the angle (rad) by
-            which the detector was turned from the robot's heading (M x 5); NaN if not known.
+        robot: for each message, x, y, z (m) and yaw (rad) of the robot, the angle (rad) by which
+            the detector was turned from the robot's heading, and the direction of up in the frame
+            of what carries the detector (M x 8); NaN if not known. A lift adds to z.
         rows: for each detection, the index of its message, ascending.
         labels: for each detection, the index of its label in `names`.
         names: the labels; some may have no detection.
@@ -241,21 +244,33 @@ def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     All messages of a slice without a known pose have one look, at 0 and with `NO_YAW`.
     """
     is_known = ~np.isnan(seen.robot.sum(axis=1))
-    x, y, z, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
+    x, y, z, yaw, pan, *up = np.where(is_known[:, None], seen.robot, 0.0).T
     turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
     facing = np.where(is_known, _decideg(yaw) % 3600, NO_YAW)
-    # Floors are at 0, 2 m, ...: half of a storey below and above is on the same one.
-    columns = (_mm(x), _mm(y), _mm(z) + STOREY_MM // 2, facing, turned)
-    cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
+    columns = (_mm(x), _mm(y), _mm(z), facing, turned)
+    lean = np.where(is_known, _leans(up), 0)
+    grid = (columns[0] // CELL_MM, columns[1] // CELL_MM, height_cells(columns[2]))
+    cells = (*grid, *(column // CELL_DECIDEG for column in columns[3:]), lean)
     _, number = distinct_rows((slices, *cells))
     look = np.where(is_known, number, -1)
     by = Groups.of(number)
     x_mm, y_mm, z_mm, *turns = (by.sums(column) // by.sizes for column in columns)
     first, last = by.ends(_rounded(seen.times))
-    slices = slices[by.firsts]
+    slices, lean = slices[by.firsts], lean[by.firsts]
     topic = np.zeros(len(slices), np.int64)
-    rows = (slices, topic, x_mm, y_mm, *turns, by.sizes, first, last, z_mm - STOREY_MM // 2)
+    rows = (slices, topic, x_mm, y_mm, *turns, by.sizes, first, last, z_mm, lean)
     return look, np.stack(rows, axis=1)
+
+
+def height_cells(z_mm: Ints) -> Ints:
+    """Returns the cell of each height: a robot on the floor is in the middle of one."""
+    return (z_mm + CELL_MM // 2) // CELL_MM
+
+
+def _leans(up: Sequence[Floats]) -> Ints:
+    """Returns a number for each direction (x, y, z) of up, to some 20 degrees; see `Look.LEAN`."""
+    x, y, z = (np.rint(axis * 3).astype(np.int64) for axis in up)
+    return x * 49 + y * 7 + z - _UPRIGHT
 
 
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:

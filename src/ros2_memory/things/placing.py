@@ -159,7 +159,7 @@ class Placer:
         for bag, messages_of_topics in by_bag.items():
             for topic, messages in messages_of_topics.items():
                 if messages.found.rows.size:
-                    nowhere = np.full((len(messages.log_times), 5), math.nan)
+                    nowhere = np.full((len(messages.log_times), 8), math.nan)
                     yield bag, target, _sights_of(topic, messages, frames, nowhere)
 
     def _new_messages(
@@ -382,13 +382,16 @@ def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:
 
 
 def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
-    """Returns the robot's pose at each message, and its detector's yaw, as in `DetectorMessages`.
+    """Returns the robot's pose at each message, and how its detector is turned and leans.
+
+    Its columns are those of `DetectorMessages.robot`.
 
     If there is no pose, it follows from the transforms of the frames that carry the detector. A
     message without a frame is taken to be in the frame of most detections.
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
-    robot = np.column_stack((_pose_at(poses, times, frames), np.zeros(len(times))))
+    ahead_and_upright = np.tile((0.0, 0.0, 0.0, 1.0), (len(times), 1))
+    robot = np.column_stack((_pose_at(poses, times, frames), ahead_and_upright))
     of_detections = detected.found.frames
     usual = ""
     if len(of_detections):
@@ -402,12 +405,14 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         if head is None or body is None:
             continue
         yaw = _yaw(body.rotation)
-        by_body = np.stack((*body.translation, yaw, 0 * yaw), axis=1)
+        by_body = np.stack((*body.translation, yaw), axis=1)
         by_body = np.where(body.valid[:, None], by_body, math.nan)
-        robot[rows] = np.where(np.isnan(robot[rows]), by_body, robot[rows])
+        robot[rows, :4] = np.where(np.isnan(robot[rows, :4]), by_body, robot[rows, :4])
+        robot[rows, 5:] = np.where(head.valid[:, None], _up(head.rotation), robot[rows, 5:])
         head_frame, body_frame = carriers
         if head_frame != body_frame:
             is_known = head.valid & body.valid
+            robot[rows, 2] += np.where(is_known, head.translation[2] - body.translation[2], 0.0)
             robot[rows, 4] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
     return robot
 
@@ -442,6 +447,13 @@ def _pose_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
 def _yaw(rotation: Rotations) -> Floats:
     x, y, z, w = rotation
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _up(rotation: Rotations) -> Floats:
+    """Returns the direction of up in each rotated frame (N x 3)."""
+    x, y, z, w = rotation
+    up = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    return np.stack(up, axis=1)
 
 
 def _sigma_ahead(covariance: object) -> float | None:

@@ -1,7 +1,8 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
 What was seen is known by slice (`analysis.sights`): 10 s of the clock.
-A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees around where it often is.
+A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees around where it often is,
+and to 20 degrees of how it leans: a robot that sits, or lies on its side, sees other things.
 The *rate* of a cell is how often its messages have the label while the thing is at the place. A
 look without a hit, from a cell that saw the place before, is evidence of absence: the higher the
 rate, the stronger. A hit is evidence of presence: the rarer false detections, the stronger. A
@@ -20,11 +21,11 @@ import numpy as np
 from ros2_memory.analysis.sights import (
     CELL_DECIDEG,
     CELL_MM,
-    STOREY_MM,
     Floats,
     Hit,
     Look,
     Unplaced,
+    height_cells,
 )
 from ros2_memory.core.arrays import (
     Flags,
@@ -123,7 +124,8 @@ class Cells:
         yield self.topic + poor * np.int64(len(sights.topics) + 1)
         yield sights.epochs[self.slice]
         yield looks[:, Look.PAN] // CELL_DECIDEG
-        yield (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM
+        yield height_cells(looks[:, Look.Z])
+        yield looks[:, Look.LEAN]
 
     @property
     def looks(self) -> Looks:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from operator import attrgetter
 from pathlib import Path
@@ -25,7 +26,7 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known, unseen
 from ros2_memory.things.find import find_things
-from tests.support.bags import Msg, detected, header, odom, text, tf, transform, write_splits
+from tests.support.bags import Msg, detected, header, make, odom, text, tf, transform, write_splits
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
 
@@ -218,6 +219,39 @@ def test_a_camera_that_is_turned_away_by_its_own_joint_misses_nothing(
     [cup] = told_of(tmp_path, [*there, *later], label="cup")["things"]
     assert next(iter(cup["still_there"])) == state
     assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("height", "roll_deg", "pitch_deg"), [(-0.3, 0, 0), (0.0, 110, 0), (0.0, 0, 35)]
+)
+def test_a_thing_that_a_robot_which_sits_or_fell_does_not_see_was_never_away(
+    tmp_path: Path, height: float, roll_deg: float, pitch_deg: float
+) -> None:
+    """It stands up, or is put upright, at the same place, and sees the thing again."""
+    roll, pitch = math.radians(roll_deg) / 2, math.radians(pitch_deg) / 2
+    lying = make(
+        "geometry_msgs/msg/Quaternion",
+        x=math.sin(roll),
+        y=math.sin(pitch),
+        z=0.0,
+        w=math.cos(roll + pitch),
+    )
+
+    def down(message: Msg) -> Msg:
+        for moved in getattr(message.body, "transforms", []):
+            if moved.child_frame_id == "base_link":
+                moved.transform.translation.z = height
+                moved.transform.rotation = lying
+        if message.topic == "/odom":
+            message.body.pose.pose.position.z = height  # type: ignore[attr-defined]
+            message.body.pose.pose.orientation = lying  # type: ignore[attr-defined]
+        return message
+
+    cup, standing = ("cup", 3.0, 0.0), partial(looked, in_map=False)
+    nothing_seen = [down(message) for message in standing(60, 120, (0.0, 0.0, 0.0))]
+    there = [standing(*span, (0.0, 0.0, 0.0), cup) for span in ((0, 60), (120, 180))]
+    [found] = told_of(tmp_path, [*there[0], *nothing_seen, *there[1]], label="cup")["things"]
+    assert (found["count"], found.get("moved")) == (120, None)
 
 
 @pytest.mark.parametrize("heading", [0.0, math.pi])

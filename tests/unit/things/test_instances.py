@@ -44,7 +44,7 @@ def estimated(*messages: Seen) -> Estimate:
     labels = Texts.of([label for _, label, _ in every])
     seen = DetectorMessages(
         np.arange(len(messages)) * 10**9,
-        np.array([(x, y, 0.0, yaw, 0.0) for (x, y, yaw), _ in messages]),
+        np.array([(x, y, 0.0, yaw, 0.0, 0.0, 0.0, 1.0) for (x, y, yaw), _ in messages]),
         np.array([row for row, *_ in every]),
         labels.codes.astype(np.int64),
         labels.words,
@@ -186,7 +186,7 @@ def _seen(
     for step, place, n, seen in given_looks:
         bag += step
         time = len(looks) * 1000
-        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, 0, n, time, time + 900, 0))
+        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, 0, n, time, time + 900, 0, 0))
         if seen > 0:  # few looks see it
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
