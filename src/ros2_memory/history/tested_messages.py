@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import plain_text
 from ros2_memory.columns.values import TruthValues, nowhere
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
@@ -138,7 +139,11 @@ class MatchTester:
             for nth, message in messages_at(self._view, rows.some(neighbours)):
                 is_match = self._search.matches(message)
                 met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
-        return Tested(rows.times, met, np.full(len(rows), source))
+        tested = Tested(rows.times, met, np.full(len(rows), source))
+        if topic in self._view.moving_topics and plain_text(self._search.condition.test):
+            # A message of transforms that does not name a frame says nothing of it.
+            return rows_of(tested, met == MET)
+        return tested
 
     def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns a number for each recording and type of a topic, in the order of `Rows.order`."""

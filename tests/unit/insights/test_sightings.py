@@ -168,6 +168,28 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
+@each_way
+def test_a_frame_among_transforms_of_others_is_seen_until_it_is_not_for_long(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Each broadcaster has messages of its own, and none says that the others' frames are gone."""
+    messages = [
+        tf(at := BEGIN + n * S // 10, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))
+        for n in range(900)
+    ]
+    for second in (*range(20), *range(60, 80)):
+        at = BEGIN + second * S + S // 20
+        messages.append(tf(at, transform(at, "odom", "tag_7", (1.0, 0.0, 0.0))))
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    seen = {"topic": "/tf", "condition_type": "contains", "value": "tag_7"}
+    newest, oldest = asked(memory, "find_matches", **seen)["sightings"]
+    for sighting, first in ((newest, 60.05), (oldest, 0.05)):
+        assert (sighting["first_seen"], sighting["count"]) == (T0 + first, 20)
+        assert sighting["duration_s"] == pytest.approx(19.0, abs=0.1)
+    whole = table(asked(memory, "find_matches", by="day", **seen))["all"]
+    assert (whole["count"], whole["seconds"]) == (2, pytest.approx(38.0, abs=0.2))
+
+
 def running_out(ask: Callable[[Call], Any]) -> Iterator[Any]:
     """What is answered where the clock may be looked at ever more often before the time is over."""
     for looks in range(1, 60):
