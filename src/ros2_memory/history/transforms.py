@@ -233,16 +233,39 @@ def _explain_failure(
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _TIMELESS:
         near_failure = _near_failure(failure, at)
-        around = TimeWindow.around(at, _LONGER_NS)
         is_unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if is_unknown and connects_in_time(view, frames, around, session):
-            advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
-            return NoDataError(reason_between(view, near), f"{near_failure.detail}; {advice}")
-        return near_failure
+        connected = _nearest_connection(view, frames, at, session) if is_unknown else None
+        if connected is None:
+            return near_failure
+        away = f"{seconds(abs(connected - at))} {'earlier' if connected < at else 'later'}"
+        advice = f"the two were connected {away}: ask about {unix_text(connected)}"
+        return NoDataError(reason_between(view, near), f"{near_failure.detail}; {advice}")
     before = view.stream.first(topics, TimeWindow.until(at), newest_first=True)
     is_between = before and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
     reason = reason_between(view, near) if is_between else reason_beyond(view, at)
     return NoDataError(reason, failure.detail)
+
+
+def _nearest_connection(view: View, frames: tuple[str, str], at: Ns, session: Session) -> Ns | None:
+    """Returns when transforms next to a moment lead from one frame to the other, to 0.1 s.
+
+    None if there are none within `_LONGER_NS`.
+    """
+
+    def leads_until(other: Ns) -> bool:
+        window = TimeWindow(min(at, other), max(at, other))
+        return connects_in_time(view, frames, window, session)
+
+    moments: list[Ns] = []
+    for direction in (-1, 1):
+        if not leads_until(at + direction * _LONGER_NS):
+            continue
+        near, far = 0, _LONGER_NS
+        while far - near > NS_PER_S // 10:
+            middle = (near + far) // 2
+            near, far = (near, middle) if leads_until(at + direction * middle) else (middle, far)
+        moments.append(at + direction * far)
+    return min(moments, key=lambda moment: abs(moment - at), default=None)
 
 
 def connects_in_time(
@@ -273,7 +296,7 @@ def connects(
     """
     sessions, linked = view.sessions, view.sessions.linked
     origin, target = (name.lstrip("/") for name in frames)
-    if (frames, session) in linked:
+    if window is None and (frames, session) in linked:
         return True
     pairs: set[Pair] = set()
     by_topic = [

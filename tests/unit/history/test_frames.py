@@ -230,6 +230,26 @@ def test_frames_are_those_of_the_newest_bags_where_there_is_no_time_for_all(
     assert answers[-1] == (["gone", "new", "old"], False)
 
 
+@each_way
+def test_of_a_frame_that_is_seen_now_and_then_the_nearest_time_is_named(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As a marker, whose transform is published while a camera sees it."""
+    messages = moving(T0, 600, "odom", "base_link", 0.0, 0.1)
+    for begin in (100, 400):
+        messages += moving(T0 + begin * S, 20, "odom", "tag", 5.0, 0.0)
+    record(tmp_path / "one", sorted(messages, key=lambda message: message.log_time))
+    memory = memory_of(tmp_path, recalls=recalls)
+    for second, away, nearest in ((200, "80 s earlier", 120.0), (350, "50 s later", 400.1)):
+        refused = looked_up(memory, T0 + second * S, "base_link", "tag")
+        assert refused["reason"] == "gap"
+        said, _, moment = refused["detail"].rpartition(": ask about ")
+        assert said.endswith(f"the two were connected {away}")
+        assert float(moment) == pytest.approx(T0 / S + nearest, abs=0.1)
+        found = asked(memory, "get_transform_at", parent="odom", child="tag", timestamp=moment)
+        assert found["translation"]["x"] == 5.0
+
+
 def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     """Neither listed, nor a reason to advise another time."""
     nameless = moving(T0, 20, "", "base_link", 0.0, 0.0)
@@ -239,7 +259,7 @@ def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
     assert [note for note in found.notes if "no name" in note and note.endswith("1")]
     refused = looked_up(memory, T0 + 300 * S, "", "base_link")
-    assert "ask about then" not in refused["detail"]
+    assert "ask about" not in refused["detail"]
 
 
 @each_way
@@ -251,7 +271,7 @@ def test_a_frame_that_no_rotation_places_is_none(tmp_path: Path, recalls: bool) 
     record(tmp_path / "one", [static, *moving(T0, 20, "odom", "base_link", 0.0, 0.0)])
     memory = memory_of(tmp_path, recalls=recalls)
     assert asked(memory, "list_frames")["frames"] == ["base_link", "odom"]
-    assert "ask about then" not in looked_up(memory, T0 + 5 * S, "base_link", "laser")["detail"]
+    assert "ask about" not in looked_up(memory, T0 + 5 * S, "base_link", "laser")["detail"]
 
 
 @settings(max_examples=examples(30))
