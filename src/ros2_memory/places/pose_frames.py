@@ -194,9 +194,11 @@ def _require_connected(view: View, frame_id: str, own_frame: str) -> None:
 
 
 def _body_there(view: View, frame_id: str, own_frame: str) -> str:
-    """Returns a clause if transforms place the robot's body in a frame, unlike its poses."""
+    """Returns a clause if transforms place the robot's body in a frame, but not its poses."""
     body = robot_body(view)
-    if body is None or own_frame == body.child or not connects(view, (frame_id, body.child)):
+    if body is None or own_frame == body.child or connects(view, (own_frame, body.child)):
+        return ""
+    if not connects(view, (frame_id, body.child)):
         return ""
     topic = view.moving_topics[0]
     return f"; transforms place {body.child} there: data.pose_topic={topic} answers by them"
