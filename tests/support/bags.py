@@ -83,6 +83,9 @@ OTHER_ROBOTS = {
         "float32 body_height\nfloat32[3] velocity\nfloat32 yaw_speed\n"
         "float32[4] range_obstacle\nint16[4] foot_force\n"
     ),
+    "px4_msgs/msg/VehicleLandDetected": (
+        "uint64 timestamp\nbool ground_contact\nbool maybe_landed\nbool landed\nbool in_air\n"
+    ),
     "px4_msgs/msg/ManyFlags": "".join(f"bool flag_{nth:03}\n" for nth in range(600)),
 }
 """Types that carry a pose in ways of their own, many booleans, or detections without a label."""

@@ -48,6 +48,7 @@ from ros2_memory.insights.topic_events import (
     last_listings,
     note_left_out,
     toggle_sentence,
+    toggled_together,
 )
 from ros2_memory.places.pose_frames import newest_pose, pose_if_placed, with_place
 from ros2_memory.results import Before, PastChange
@@ -86,6 +87,7 @@ class _DatedChange(NamedTuple):
     first: Ns
     last: Ns
     text: str
+    topic: str = ""
 
 
 class ChangesBefore:
@@ -117,23 +119,33 @@ class ChangesBefore:
         """
         begin = bisect_left(self._changes, (at + slack + 1,))
         end = bisect_left(self._changes, (at + length + 1,))
-        return tuple(PastChange(text, at - first) for first, _, text in self._changes[begin:end])
+        changes = self._changes[begin:end]
+        return tuple(PastChange(change.text, at - change.first) for change in changes)
 
     def before(
-        self, at: Ns, length: Ns = LENGTH_NS, *, without: str = "", slack: Ns = 0
+        self,
+        at: Ns,
+        length: Ns = LENGTH_NS,
+        *,
+        without: str = "",
+        beside: str = "",
+        slack: Ns = 0,
     ) -> tuple[PastChange, ...]:
         """Returns the changes in the time (ns) before a moment, nearest first.
 
         A change up to `slack` after the moment counts as at the moment. Sentences that begin with
-        `without` are left out.
+        `without` are left out, and changes of the topic `beside` at the moment itself: what else
+        its message says came with the event, not before it.
         """
         changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
         end = bisect_left(self._changes, (at + slack + 1,))
-        for first, last, text in self._changes[begin:end]:
+        for first, last, text, topic in self._changes[begin:end]:
             # A report that goes on is repeated within seconds, if not at the moment itself.
             since = max(0, at - last)
-            if since <= length and not (without and text.startswith(without)):
+            is_own = bool(without) and text.startswith(without)
+            is_beside = bool(beside) and topic == beside and first == at
+            if since <= length and not is_own and not is_beside:
                 changes[first, text] = PastChange(text, since)
         return tuple(sorted(changes.values(), key=lambda change: change.before))
 
@@ -263,11 +275,10 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
         span_s, often = unix_from_ns(report.last - report.first), report.reports
         again = f" ({often} times in {span_s:.0f} s)" if often > 1 else ""
         yield _DatedChange(report.first, report.last, Quoted(report.text + again))
+    yield from _toggles_of_topic(topic, events)
     level = next((state.first for state in events.known if state.kind == CHARGE), 0)
     for change in events.changes:
-        if change.kind == FLAG:
-            text = toggle_sentence(topic, change)
-        elif change.kind == GOAL and change.value not in GOAL_WORDS:
+        if change.kind == GOAL and change.value not in GOAL_WORDS:
             text = ""  # it was accepted before
         else:
             text = _change_sentence(topic, change, level)
@@ -283,6 +294,13 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
             text = _change_sentence(topic, change, 0)
             if text:
                 yield _DatedChange(state.at, state.at, text)
+
+
+def _toggles_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
+    """Yields when booleans of a topic toggled; those of one message to the same value at once."""
+    for together in toggled_together(change for change in events.changes if change.kind == FLAG):
+        at = together[0].time
+        yield _DatedChange(at, at, toggle_sentence(topic, *together), topic)
 
 
 def _change_sentence(topic: str, change: Change, level_before: int) -> str:

@@ -8,7 +8,7 @@ left out, and counted.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 from heapq import nsmallest
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -54,6 +54,7 @@ from ros2_memory.insights.topic_events import (
     note_foxglove_logs,
     note_limits,
     toggle_sentence,
+    toggled_together,
 )
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
@@ -505,19 +506,25 @@ def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
 
 
 def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
-    """Yields each toggle with how long its value is known to hold.
+    """Yields toggles with how long their values are known to hold.
 
     That is until the next toggle, or until one of `ends` (ns, in order); else beyond the window.
+    Booleans of a message that become the same, for as long, are one event.
     """
     next_toggle: dict[str, Ns] = {}
+    toggles_by_end: defaultdict[Ns | None, list[Change]] = defaultdict(list)
     for toggle in reversed(toggles):
         end = next_toggle.get(toggle.name)
         nth = bisect_left(ends, toggle.time)
         if nth < len(ends) and (end is None or ends[nth] < end):
             end = ends[nth]
-        text = toggle_sentence(topic, toggle)
-        yield Event("flip", toggle.time, end, text, goes_on=end is None)
+        toggles_by_end[end].append(toggle)
         next_toggle[toggle.name] = toggle.time
+    for end, ending_then in toggles_by_end.items():
+        for together in toggled_together(reversed(ending_then)):
+            text = toggle_sentence(topic, *together)
+            at = together[0].time
+            yield Event("flip", at, end, text, goes_on=end is None, topic=topic)
 
 
 def _low_charge_events(view: View, topic: str, events: TopicEvents) -> Iterator[Event]:
@@ -566,7 +573,7 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
     for event in events:
         if event.kind == "flip":
             own_sentence, _, _ = event.text.rpartition(" ")
-            past[event] = changes.before(event.start, without=own_sentence)
+            past[event] = changes.before(event.start, without=own_sentence, beside=event.topic)
         elif event.kind in {"stop", "drop"}:
             past[event] = changes.before(event.start, slack=SLACK_NS)
     counts_shown = _counts_shown(past)

@@ -32,7 +32,7 @@ from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, counted
+from ros2_memory.core.text import Reason, counted, listed
 from ros2_memory.history.context import Note
 from ros2_memory.history.held_values import breaks_of, held_at, is_latched
 from ros2_memory.history.scan import (
@@ -57,6 +57,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 
+_MOST_NAMED: Final = 5
+"""So many booleans that toggled in one message are named."""
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
 
 
@@ -65,9 +67,20 @@ def flag_name(topic: str, flag: KnownState | Change) -> str:
     return topic if flag.name == "value" else f"{topic} {flag.name}"
 
 
-def toggle_sentence(topic: str, toggle: Change) -> str:
-    """Returns "... became true" for a boolean that toggled."""
-    return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
+def toggle_sentence(topic: str, *toggles: Change) -> str:
+    """Returns "... became true" for booleans of a message that toggled to the same value."""
+    named = flag_name(topic, toggles[0])
+    if len(toggles) > 1:
+        named = f"{topic} {listed([toggle.name for toggle in toggles], at_most=_MOST_NAMED)}"
+    return f"{named} became {'true' if toggles[0].value else 'false'}"
+
+
+def toggled_together(toggles: Iterable[Change]) -> list[list[Change]]:
+    """Returns toggles in groups: those of one message to the same value, in their order."""
+    groups: defaultdict[tuple[Ns, bool], list[Change]] = defaultdict(list)
+    for toggle in toggles:
+        groups[toggle.time, bool(toggle.value)].append(toggle)
+    return [*groups.values()]
 
 
 def message_before(view: View, topic: str, first: Ns) -> StoredMessage | None:

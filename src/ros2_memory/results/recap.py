@@ -245,6 +245,7 @@ class Event:
         score: the best score of a thing in view.
         skipped: how much of its time the clock skipped.
         point: where the robot was (m), in the frame of the recap; None if that is not known.
+        topic: whose message it is, of booleans; else empty.
     """
 
     kind: str
@@ -257,6 +258,7 @@ class Event:
     score: float | None = None
     skipped: Ns = 0
     point: tuple[float, float] | None = None
+    topic: str = ""
 
 
 @result(

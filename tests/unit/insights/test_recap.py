@@ -138,6 +138,38 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
+def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Path) -> None:
+    def lands(second: int, *, landed: bool) -> Msg:
+        type_name = "px4_msgs/msg/VehicleLandDetected"
+        flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), landed)
+        body = make(type_name, timestamp=second, in_air=not landed, **flags)
+        return Msg("/landed", type_name, BEGIN + second * S, body)
+
+    messages = [lands(second, landed=not 20 <= second < 40) for second in range(60)]
+    messages += [boolean(BEGIN + second * S, second >= 18, "/armed") for second in range(60)]
+    messages += [odom(BEGIN + second * S) for second in range(60)]
+    memory = remembered(tmp_path, messages)
+    events = asked(memory, "recap", start=T0, end=T0 + 60)["events"]
+    flips = [event for event in events if "became" in event["text"]]
+    on_ground = "/landed ground_contact, maybe_landed, landed became"
+    before = [{"text": "/armed became true", "s_before": 2.0}]
+    assert [(flip["timestamp"] - T0, flip["text"]) for flip in flips] == [
+        (18, "/armed became true"),
+        (20, f"{on_ground} false"),
+        (20, "/landed in_air became true"),
+        (40, f"{on_ground} true"),
+        (40, "/landed in_air became false"),
+    ]
+    assert [flip.get("duration_s") for flip in flips] == [None, 20.0, 20.0, None, None]
+    assert [flip.get("before") for flip in flips] == [None, before, before, None, None]
+    around = asked(memory, "recap", around=T0 + 21)
+    assert [change["text"] for change in around["before"]] == [
+        f"{on_ground} false",
+        "/landed in_air became true",
+        "/armed became true",
+    ]
+
+
 def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: Path) -> None:
     """A robot that drives at 0.5 m/s, recorded for 20 s, an hour later, and another hour later."""
     for run in range(3):
