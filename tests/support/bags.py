@@ -77,6 +77,7 @@ OTHER_ROBOTS = {
     "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",
     "radar_msgs/msg/RadarScan": "std_msgs/Header header\nRadarReturn[] returns\n",
+    "mavros_msgs/msg/StatusText": "uint8 WARNING = 4\nuint8 severity\nstring text\n",
     "unitree_go/msg/IMUState": "float32[4] quaternion\n",
     "unitree_go/msg/SportModeState": (
         "uint32 error_code\nIMUState imu_state\nuint8 mode\nuint8 gait_type\nfloat32[3] position\n"

@@ -42,7 +42,11 @@ _FEW_MESSAGES: Final = 5
 """Fewer messages have no usual spacing: a map may be published twice when its node starts."""
 
 
-_LOGS: Final = FOXGLOVE_LOGS | {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
+_LOGS: Final = FOXGLOVE_LOGS | {
+    "rcl_interfaces/msg/Log",
+    "rcl_interfaces/Log",
+    "mavros_msgs/msg/StatusText",
+}
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2

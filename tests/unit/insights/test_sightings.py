@@ -87,6 +87,22 @@ def test_never_names_a_label_with_spaces_that_was_asked_for_without(tmp_path: Pa
     assert found.notes == (note,)
 
 
+@each_way
+def test_each_text_that_an_autopilot_reports_is_one_sighting(tmp_path: Path, recalls: bool) -> None:
+    """It is a line of a log: the next one, minutes later, does not end it."""
+    type_name = "mavros_msgs/msg/StatusText"
+    lines = {0: (6, "Takeoff"), 400: (4, "Wind"), 401: (4, "Wind"), 900: (6, "Landed")}
+    said = [
+        Msg("/texts", type_name, BEGIN + at * S, make(type_name, severity=level, text=words))
+        for at, (level, words) in lines.items()
+    ]
+    memory = remembered(tmp_path, [*said, odom(BEGIN + 950 * S)], recalls=recalls)
+    given = {"condition_type": "equals", "field": "severity", "value": "WARNING"}
+    reply = asked(memory, "find_matches", topic="/texts", **given)
+    assert [sighting["first_seen"] - T0 for sighting in reply["sightings"]] == [401, 400]
+    assert [sighting["duration_s"] for sighting in reply["sightings"]] == [0.0, 0.0]
+
+
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
     memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
