@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, repeating
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
@@ -56,6 +56,8 @@ _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
 """Detectors publish at their own times."""
 _MM: Final = 1000.0
+_SCATTERS: Final = 3.0
+"""Things of one label that are no farther apart than so many times their scatter may be one."""
 
 
 def find_things(
@@ -139,8 +141,29 @@ def find_things(
         labels=tuple(sorted(totals.items())),
         now=now,
         all_counted=known.reaches_back(window),
-        notes=(*view.notes.sentences(), *notes_on(view, known.by_all, question)),
+        notes=(
+            *view.notes.sentences(),
+            *notes_on(view, known.by_all, question),
+            *_describe_scatter(shown),
+        ),
     )
+
+
+def _describe_scatter(shown: Sequence[Thing]) -> Iterator[str]:
+    """Yields for a label whether two of its things are so near that noise may have parted them."""
+    nearest: dict[str, tuple[float, float]] = {}
+    for one, other in combinations([thing for thing in shown if not thing.moves], 2):
+        if (one.label, one.frame_id) != (other.label, other.frame_id):
+            continue
+        away_m, spread_m = math.dist(one.place, other.place), max(one.spread_m, other.spread_m)
+        if away_m <= _SCATTERS * spread_m:
+            nearest[one.label] = min((away_m, spread_m), nearest.get(one.label, (math.inf, 0.0)))
+    for label, (away_m, spread_m) in nearest.items():
+        yield repeating(
+            f"{label}: two of these are only {away_m:.2f} m apart, where detections of it scatter "
+            f"by {spread_m:.2f} m (spread_m): they may be one thing",
+            [label],
+        )
 
 
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:

@@ -1,6 +1,7 @@
 """Questions about things over bags, with a robot whose map moves under its odometry."""
 
 import math
+import re
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -179,6 +180,27 @@ def test_where_the_robots_poses_are_to_be_chosen_unplaced_detections_say_so(tmp_
             "or give topic where the tool takes it"
         ),
     ]
+
+
+@pytest.mark.parametrize(("noise_m", "is_told"), [(0.5, True), (0.02, False)])
+def test_things_that_are_nearer_to_each_other_than_noise_throws_detections_are_told(
+    tmp_path: Path, noise_m: float, is_told: bool
+) -> None:
+    """As of a drone that looks at the ground from 30 m; the second pair is 1.1 m apart."""
+    random = Random(5)
+    messages: list[Msg] = []
+    for at in range(300):
+        cups = [(3.0, 0.0)] if at % 3 else [(3.0, 1.1)]
+        seen = [
+            ("cup", x + random.gauss(0, noise_m), y + random.gauss(0, noise_m)) for x, y in cups
+        ]
+        messages += scene(at, HERE, seen)
+    found = told_of(tmp_path, messages, label="cup")
+    assert found["total"] >= 2
+    told = [note for note in found.get("notes", ()) if "they may be one thing" in note]
+    assert bool(told) == is_told
+    if told:
+        assert re.match(r"cup: two of these are only [01]\.\d\d m apart", told[0])
 
 
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
