@@ -142,6 +142,22 @@ class PlanarPose:
 
 
 @dataclass(frozen=True, slots=True)
+class GeodeticPosition:
+    """Reads a position on the Earth.
+
+    Attributes:
+        latitude: where the latitude is (degrees); likewise longitude and altitude (m).
+        status: where the status of the fix is; a lower one than `least` is none.
+    """
+
+    latitude: Route
+    longitude: Route
+    altitude: Route
+    status: Route
+    least: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """The compiled schema map of one type.
 
@@ -149,7 +165,7 @@ class Plan:
         fields: the path of each field that is shown.
         poses: ways to read a pose, the first choice first.
         twists: the paths of linear and angular velocities, the first choice first.
-        geodetic: the paths of latitudes, longitudes, altitudes and the status of a fix.
+        geodetic: ways to read a position on the Earth, the first choice first.
         pose_frame: the path of PX4's number of the pose's frame.
         velocity_frame: the path of PX4's number of the velocity's frame.
     """
@@ -157,7 +173,7 @@ class Plan:
     fields: Mapping[str, Segments]
     poses: tuple[PointPose | PlanarPose, ...]
     twists: tuple[tuple[Route, Route], ...]
-    geodetic: tuple[tuple[Route, ...], ...] = ()
+    geodetic: tuple[GeodeticPosition, ...] = ()
     pose_frame: Route | None = None
     velocity_frame: Route | None = None
 
@@ -177,10 +193,17 @@ UNMAPPED: Final = Plan(
         (Route(*prefix, "linear"), Route(*prefix, "angular"))
         for prefix in (("twist", "twist"), ("twist",))
     ),
-    geodetic=tuple(
-        (*(Route(*prefix, name) for name in names), Route("status", "status"))
-        for prefix in ((), ("position",), ("pose", "position"))
-        for names in (("latitude", "longitude", "altitude"), ("lat", "lon", "alt"))
+    geodetic=(
+        *(
+            GeodeticPosition(
+                *(Route(*prefix, name) for name in names), status=Route("status", "status")
+            )
+            for prefix in ((), ("position",), ("pose", "position"))
+            for names in (("latitude", "longitude", "altitude"), ("lat", "lon", "alt"))
+        ),
+        GeodeticPosition(  # as PX4's SensorGps has them; 0 and 1 are no fix
+            *map(Route, ("latitude_deg", "longitude_deg", "altitude_msl_m", "fix_type")), least=2
+        ),
     ),
 )
 """For a type that is not in the schema map."""
@@ -294,18 +317,19 @@ class SchemaExtractor:
         """Returns the position of a message on the Earth (degrees, m); None if it has none.
 
         It is read by the schema map's names; for a type that is not in the map, from `latitude` and
-        `longitude`, or `lat` and `lon`, in the message, its `position` or `pose.position`, unless
-        these numbers cannot be degrees.
+        `longitude`, or `lat` and `lon`, in the message, its `position` or `pose.position`, or from
+        `latitude_deg` and `longitude_deg`, unless these numbers cannot be degrees.
         """
         plan = self.plan(type_name)
-        for routes in plan.geodetic:
+        for place in plan.geodetic:
+            routes = (place.latitude, place.longitude, place.altitude, place.status)
             latitude, longitude, altitude, status = (number(route.of(message)) for route in routes)
             if latitude is None or longitude is None:
                 continue
             if plan is UNMAPPED and (abs(latitude) > 90 or abs(longitude) > 360):
                 continue
             altitude_m = math.nan if altitude is None else altitude
-            has_fix = status is None or status >= 0
+            has_fix = status is None or status >= place.least
             return Geodetic(latitude, longitude, altitude_m, self.frame(message), has_fix)
         return None
 
@@ -466,12 +490,12 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
         return Route(*paths[name]) if name in paths else _NOWHERE
 
     twist = (route("linear_velocity"), route("angular_velocity"))
-    geodetic = tuple(map(route, ("latitude", "longitude", "altitude", "fix_status")))
+    geodetic = GeodeticPosition(*map(route, ("latitude", "longitude", "altitude", "fix_status")))
     return Plan(
         fields=paths,
         poses=_poses(paths.keys(), route),
         twists=() if _NOWHERE in twist else (twist,),
-        geodetic=() if _NOWHERE in geodetic[:2] else (geodetic,),
+        geodetic=() if _NOWHERE in (geodetic.latitude, geodetic.longitude) else (geodetic,),
         pose_frame=route("pose_frame") if "pose_frame" in paths else None,
         velocity_frame=route("velocity_frame") if "velocity_frame" in paths else None,
     )

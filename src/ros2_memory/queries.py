@@ -308,7 +308,7 @@ def _note_geodetic(view: View, geodetic: Geodetic) -> None:
     if not (math.isfinite(geodetic.latitude) and math.isfinite(geodetic.longitude)):
         view.notes.add(_NOT_A_NUMBER)
     if not geodetic.has_fix:
-        view.notes.add("no fix: the receiver states (fix_status -1) that this is not its position")
+        view.notes.add("no fix: the receiver states that this is not its position")
 
 
 def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | None) -> Pose:

@@ -84,6 +84,10 @@ OTHER_ROBOTS = {
         "float32 body_height\nfloat32[3] velocity\nfloat32 yaw_speed\n"
         "float32[4] range_obstacle\nint16[4] foot_force\n"
     ),
+    "px4_msgs/msg/SensorGps": (
+        "uint64 timestamp\nfloat64 latitude_deg\nfloat64 longitude_deg\nfloat64 altitude_msl_m\n"
+        "uint8 fix_type\n"
+    ),
     "px4_msgs/msg/VehicleLandDetected": (
         "uint64 timestamp\nbool ground_contact\nbool maybe_landed\nbool landed\nbool in_air\n"
     ),

@@ -87,6 +87,30 @@ def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
     assert "carries no position" in refused["detail"]
 
 
+@each_way
+def test_latitude_and_longitude_of_a_receiver_of_px4_are_its_position(
+    tmp_path: Path, recalls: bool
+) -> None:
+    type_name, degrees = "px4_msgs/msg/SensorGps", {"latitude_deg": 48.1, "longitude_deg": 11.7}
+    messages = [
+        Msg(
+            "/gps",
+            type_name,
+            T0 + n * S,
+            make(type_name, timestamp=n, **degrees, altitude_msl_m=520.0 + n, fix_type=fix_type),
+        )
+        for n, fix_type in enumerate([3, 1, 6])
+    ]
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    for n, has_fix in enumerate([True, False, True]):
+        found = asked(memory, "get_position_at", timestamp=T0_S + n, topic="/gps")
+        assert (found["latitude"], found["longitude"]) == (48.1, 11.7)
+        assert found["altitude"] == 520.0 + n
+        assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
+    refused = asked(memory, "get_position_at", timestamp=T0_S)
+    assert "latitude and longitude are on /gps (px4_msgs/msg/SensorGps)" in refused["detail"]
+
+
 def test_a_position_without_a_fix_says_so_and_is_in_no_map_and_its_numbers_are_told(
     tmp_path: Path,
 ) -> None:
