@@ -15,6 +15,7 @@ It begins with the first pose at its place and ends with the last one.
 - **Ends.** The ends of a row of still blocks are found pose by pose. Some slots just inside give
   the place and its noise. From there poses are followed outwards until two in a row are elsewhere,
   or one that noise does not explain. The last pose before that is clearly at the place is the end.
+  Two rows at one place whose ends meet are one standstill, which noise parted.
 
 All this depends on poses a few slots around, and slots and blocks are counted from the epoch. The
 `Blocks` of a stretch of time follow from its poses and those `BESIDE_NS` beside it. So a standstill
@@ -134,6 +135,11 @@ class Box3(NamedTuple):
     def diagonal(self) -> float:
         """The distance (m) of opposite corners."""
         return math.dist(self.low, self.high)
+
+    def united(self, other: Box3) -> Box3:
+        """Returns the smallest box around both."""
+        (a, b, c), (d, e, f) = (map(min, self.low, other.low), map(max, self.high, other.high))
+        return Box3((a, b, c), (d, e, f))
 
 
 class Standstill(NamedTuple):
@@ -454,12 +460,21 @@ def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
     runs = (column.tolist() for column in (begins, stops, starts, ends))
     corners = blocks.corners()
     stands: list[Standstill] = []
-    newest_end = MIN_NS
+    newest_end, newest_box = MIN_NS, None
     for begin, stop, since, end, box in zip(*runs, _boxes(corners, begins, stops), strict=True):
         # The ends of two standstills may reach into each other's slots.
         start = max(since, newest_end)
+        if since <= newest_end and newest_box is not None:
+            # No pose is elsewhere between two at one place: noise parted them.
+            whole, both = stands[-1].box.united(box), newest_box.united(box)
+            apart_m = both.diagonal - newest_box.diagonal - box.diagonal
+            if (apart_m <= 0 or both.diagonal <= LARGEST_M) and whole.diagonal <= DRIFTED_M:
+                newest_end, newest_box = max(end, newest_end), box
+                stands[-1] = stands[-1]._replace(end=newest_end, box=whole)
+                continue
         if end - start < SHORTEST_NS:
             continue
+        newest_box = box
         if box.diagonal <= DRIFTED_M:
             stands.append(Standstill(start, end, box))
         else:

@@ -223,3 +223,18 @@ def test_slices_of_any_length_change_no_drop(
     if silent:
         poses = [each for each in poses if (each[0] - BEGIN) // DROP_SLOT_NS % 17 > 1]
     assert stood_in(turned(poses), blocks=blocks)[1] == found(poses)
+
+
+@pytest.mark.parametrize("seed", [11, 64, 65, 70, 92])
+def test_noise_of_rare_poses_does_not_part_a_standstill(seed: int) -> None:
+    """Two poses a second, each off by 1 cm; the robot brakes at 123 s, and goes on at 140 s."""
+    draw = random.Random(seed)
+    poses: Poses = []
+    x = 0.0
+    for nth in range(130):
+        time = 100 + nth / 2
+        x += 0.25 * min(1, max(0, (125 - time) / 2, (time - 140) / 2))
+        poses.append((round(time * S), (x + draw.gauss(0, 0.01), draw.gauss(0, 0.01), 0.0)))
+    [whole] = standstills_of(poses)
+    assert whole == pytest.approx((124, 140), abs=0.5)
+    assert standstills_of(poses, blocks=3) == [whole]
