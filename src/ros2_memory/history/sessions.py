@@ -22,7 +22,7 @@ from weakref import proxy
 import numpy as np
 
 from ros2_memory.analysis.frames import is_edge
-from ros2_memory.bag_dir.layout import CARRY_FOLDER
+from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.store import relative
@@ -59,6 +59,7 @@ Session: TypeAlias = frozenset[str]
 
 _AROUND_NS: Final = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
+_BETWEEN_THINNED_NS: Final[Ns] = NS_PER_S
 _FEW_SESSIONS: Final = 4
 """After this many sessions, the static transforms of all are looked up at once."""
 _UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
@@ -331,7 +332,9 @@ class Sessions:
     def newest(self, topic: str, window: TimeWindow, recording: Path) -> StoredMessage | None:
         """Returns the newest message of a topic in a window from the session of a recording.
 
-        From any session, if that one has no message of the topic at all.
+        From any session, if that one has no message of the topic at all. A thinned day stands for
+        deleted bags of the session: its message counts where the session's own is older by more
+        than a second, which is how often a day has one.
         """
         newest, session = self._view.stream.newest(topic, window), self.session_of(recording)
         if not self.recordings_of(session, (topic,)):
@@ -340,7 +343,11 @@ class Sessions:
         if newest is not None and any(extent.bag == newest.bag for extent in extents):
             return newest
         merged = self._view.stream.merged(extents, [topic], window, newest_first=True)
-        return next(self._view.bags.track_sources(merged), None)
+        own = next(self._view.bags.track_sources(merged), None)
+        if newest is None or not is_thinned(newest.bag.file):
+            return own
+        is_old = own is None or own.time < newest.time - _BETWEEN_THINNED_NS
+        return newest if is_old else own
 
     def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
         """Returns the moving transforms of a session in a window, in log-time order."""

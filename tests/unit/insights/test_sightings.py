@@ -576,6 +576,25 @@ def test_where_the_robot_was_is_known_long_after_a_topic_spoke(
     assert [row["robot"]["x"] for row in tasks] == [2.0]
 
 
+@each_way
+@pytest.mark.parametrize(("since_s", "x"), [(10.05, 15.05), (3.05, 10.4)])
+def test_the_robot_is_where_a_thinned_day_has_it_if_a_bag_between_was_deleted(
+    tmp_path: Path, since_s: float, x: float, recalls: bool
+) -> None:
+    """Between two bags of one run there was another, of which poses stayed, or none."""
+    first = [odom(BEGIN + nth * S // 10, nth / 10) for nth in range(105)]
+    last = [odom(BEGIN + nth * S // 10, nth / 10) for nth in range(156, 300)]
+    last.insert(0, text(BEGIN + 155 * S // 10, "hello"))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", first)
+    write_mcap(tmp_path / "rec" / "rec_2.mcap", last)
+    day = [odom(BEGIN + round(at * S), at) for at in (since_s + nth for nth in range(6))]
+    write_mcap(tmp_path / "memory" / "20260714.thinned.mcap", day)
+    memory = memory_of(tmp_path, recalls=recalls)
+    given = {"topic": "/chatter", "condition_type": "equals", "value": "hello"}
+    [row] = asked(memory, "find_matches", **given)["sightings"]
+    assert row["robot"]["x"] == pytest.approx(x, abs=0.001)
+
+
 def test_of_more_episodes_than_are_counted_the_newest_are(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
