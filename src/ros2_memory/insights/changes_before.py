@@ -12,6 +12,8 @@ from bisect import bisect_left, bisect_right
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.analysis.facts import (
     BATTERY,
     CHARGE,
@@ -183,14 +185,16 @@ def changes_in(
         can_show_changes = any(map(has_changes, types)) or (events is not None and events.known)
         if can_show_changes and _is_recorded(view, topic, window):
             looked_at.append(topic)
-    changes = [
-        change
-        for topic, events in events_of_topics.items()
-        if topic != command
-        for change in _changes_of_topic(topic, events)
-    ]
+    changes: list[_DatedChange] = []
+    for topic, events in events_of_topics.items():
+        if topic == command:
+            of_topic = _commanded_stops(view, command, events_of_topics)
+        else:
+            of_topic = _changes_of_topic(topic, events)
+        firsts = _firsts_of_runs(view, topic, window)
+        changes += (change for change in of_topic if change.first not in firsts)
     return ChangesBefore(
-        [*changes, *_commanded_stops(view, command, events_of_topics)],
+        changes,
         tuple(looked_at),
         tuple(_state_at_end(view, window, events_of_topics)),
         events_of_topics,
@@ -201,8 +205,6 @@ def _commanded_stops(
     view: View, command: str, events_of_topics: Mapping[str, TopicEvents]
 ) -> Iterator[_DatedChange]:
     """Yields when the commanded velocity became zero while a goal was active."""
-    if command not in events_of_topics:
-        return
     activities = {topic: [*_goal_activity(events)] for topic, events in events_of_topics.items()}
     _, commands = events_of_topics[command].of_kind(COMMAND)
     for change in commands:
@@ -215,6 +217,23 @@ def _commanded_stops(
         if is_active:
             text = f"{command} went to zero while a goal was active"
             yield _DatedChange(change.time, change.time, text)
+
+
+def _firsts_of_runs(view: View, topic: str, window: TimeWindow) -> frozenset[Ns]:
+    """Returns the log times of a topic's first messages in runs of the recorder.
+
+    What such a message states may be so for long. None of a log, nor of a latched topic.
+    """
+    if view.timeline.is_log(topic) or _holds_over_runs(view, topic):
+        return frozenset()
+    firsts = np.sort(view.bounds(topic, window.widened(_OLDEST_STATE_NS))[0])
+    nth = np.searchsorted(firsts, [stop for _, stop in view.snapshot.breaks])
+    return frozenset(firsts[nth[nth < firsts.size]].tolist())
+
+
+def _holds_over_runs(view: View, topic: str) -> bool:
+    """Returns whether what a topic said holds in the next run of the recorder: no goals do."""
+    return is_latched(view, topic) and GOALS not in view.timeline.types_of(topic)
 
 
 def _has_message_of_run(view: View, topic: str, at: Ns) -> bool:
@@ -260,7 +279,7 @@ def _with_state_before(
     if not (LOG in types or events is None or events.known):
         return None
     start = max(window.start - _LEAD_NS, MIN_NS)
-    if is_latched(view, topic) and GOALS not in types:
+    if _holds_over_runs(view, topic):
         newest = held_at(view, topic, start)
     else:
         newest = view.stream.newest(topic, TimeWindow(max(start - _OLDEST_STATE_NS, MIN_NS), start))
@@ -356,8 +375,8 @@ def _state_at_end(
     From before the recorder's current run only the values of latched topics hold, and no goals.
     """
     for topic, events in events_of_topics.items():
-        holds = is_latched(view, topic) and GOALS not in view.timeline.types_of(topic)
-        if not holds and not _has_message_of_run(view, topic, window.stop - 1):
+        is_of_run = _has_message_of_run(view, topic, window.stop - 1)
+        if not (is_of_run or _holds_over_runs(view, topic)):
             continue
         is_battery = any(state.kind == CHARGE for state in events.known)
         flags, _ = events.of_kind(FLAG)

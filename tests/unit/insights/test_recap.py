@@ -300,6 +300,27 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
     assert reply["state"] == {"/docked": True} | ({"/drive goal": "active"} if listed_again else {})
 
 
+@each_way
+def test_what_the_first_message_after_a_restart_says_is_no_change(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It may have been so for long: the robot was off for nine minutes."""
+    for name, begin, is_worse in (("first", 0, False), ("second", 600, True)):
+        level, charge, vx = (2, 0.09, 0.0) if is_worse else (0, 0.5, 0.4)
+        body = [odom(at(begin + t / 10)) for t in range(300)]
+        for t in range(begin + 1, begin + 30):
+            body += [battery(at(t), charge), diagnostics(at(t), lidar=(level, ""))]
+            body += [boolean(at(t), is_worse), command(at(t), vx), goals(at(t), {1: 2})]
+        body.append(battery(at(begin + 8.5), 0.04))
+        write_splits(tmp_path, body, name=name)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert told(before(memory, 609.0)) == [("/battery_state fell below 5%", 0.5)]
+    for start in (0, 600):
+        events = asked(memory, "recap", start=T0 + start, end=T0 + 629)["events"]
+        *_, stop = (event for event in events if event["text"].startswith("stood at"))
+        assert (stop["timestamp"], stop.get("before")) == (T0 + 600, None)
+
+
 @pytest.mark.parametrize("ended", [1, 2])
 def test_a_goal_that_runs_is_the_state_beside_an_older_one_that_stays_listed(
     tmp_path: Path, ended: int
