@@ -36,7 +36,6 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     Ns,
     ns_from_unix,
-    unix_from_ns,
 )
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
@@ -64,6 +63,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
 from ros2_memory.history.no_data import (
+    accepting,
     decode,
     describe_lack,
     no_data_at,
@@ -411,11 +411,10 @@ def _too_old_error(
     if newest is None or tolerance is None or not has_others:
         return None
     age = at - newest[0].time
-    enough = math.ceil(unix_from_ns(age) * 1000) / 1000
     detail = (
-        f"no transform of {body.child!r} in {parent!r} within {seconds(tolerance)} before "
+        f"no transform of {body.child} in {parent} within {seconds(tolerance)} before "
         f"{unix_text(at)}; the nearest older one is {seconds(age)} before it, at "
-        f"{unix_text(newest[0].time)}; to accept it, ask with tolerance_s of at least {enough:.3f}"
+        f"{unix_text(newest[0].time)}; {accepting(newest[0], at)}"
     )
     error = NoDataError(NoDataReason.BETWEEN_MESSAGES, detail)
     return with_notes(view, within, error)

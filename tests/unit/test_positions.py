@@ -1,5 +1,6 @@
 """Positions come from whatever carries one, and refusals name what does."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -330,7 +331,7 @@ def test_a_lost_transform_of_the_body_is_told_where_other_frames_have_newer_ones
     memory = remembered(tmp_path, sorted([*driven, *turning], key=lambda message: message.log_time))
     reply = asked(memory, "get_position_at", timestamp=T0_S + 3.03)
     assert reply["reason"] == "between_messages"
-    assert "no transform of 'base_link' in 'map' within 0.1 s before" in reply["detail"]
+    assert "no transform of base_link in map within 0.1 s before" in reply["detail"]
     assert "the nearest older one is 0.13 s before it" in reply["detail"]
     assert "ask with tolerance_s of at least 0.130" in reply["detail"]
     reply = asked(memory, "get_position_at", timestamp=T0_S + 3.03, tolerance_s=0.13)
@@ -374,6 +375,35 @@ def test_a_frame_that_the_map_corrects_is_not_the_body(tmp_path: Path, body: str
     memory = remembered(tmp_path, messages)
     reply = asked(memory, "get_position_at", timestamp=T0_S + 5, topic="/tf")
     assert (reply["x"], reply["notes"]) == (6.0, [f"by transforms, of {body}"])
+
+
+@each_way
+def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool) -> None:
+    """Its localiser goes on ten times a second, its odometry once, and not from 20 to 40 s."""
+    messages: list[Msg] = []
+    for tenth in range(600):
+        at = T0 + tenth * S // 10
+        messages.append(tf(at, transform(at, "map", "odom", (1.0, 0.0, 0.0))))
+        if tenth % 10 == 0 and not 200 < tenth < 400:
+            messages.append(tf(at + 1, transform(at, "odom", "base_link", (tenth / 10, 0.0, 0.0))))
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    refused = asked(memory, "get_position_at", timestamp=T0_S + 10.5)
+    assert refused["reason"] == "between_messages"
+    assert "no transform of base_link in map within 0.1 s" in refused["detail"]
+    assert refused["detail"].endswith("ask with tolerance_s of at least 0.500")
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 10.5, tolerance_s=0.5)
+    assert reply["x"] == 11.0
+    refused = asked(memory, "trajectory_summary", start=T0_S + 25, end=T0_S + 35)
+    assert refused["detail"].startswith("no message of /tf between")
+    assert refused["detail"].endswith("places base_link")
+
+
+def test_positions_that_are_no_numbers_are_not_said_to_be_missing(tmp_path: Path) -> None:
+    poses = [odom(T0 + n * S, math.nan if 20 <= n < 40 else n) for n in range(60)]
+    memory = remembered(tmp_path, poses)
+    for given in ({"where": {"x": [0, 9], "y": [-1, 1]}}, {"by": "hour"}):
+        refused = asked(memory, "trajectory_summary", start=T0_S + 25, end=T0_S + 35, **given)
+        assert refused["detail"].endswith("has a valid position")
 
 
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:

@@ -13,7 +13,11 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
-from ros2_memory.history.driven_path import no_path, path_by_poses, resolve_path_topic
+from ros2_memory.history.driven_path import (
+    no_path,
+    path_by_poses,
+    resolve_path_topic,
+)
 from ros2_memory.history.robots import note_robots, require_one_robot
 from ros2_memory.history.view import TimeRange, View, clamped, open_span, open_view, search_window
 from ros2_memory.places.driven_inside import totals_inside
@@ -66,7 +70,7 @@ def count_path(
     name = resolve_path_topic(view, topic)
     binned = BinnedWindow(view, asked, by, (name,), place_asked)
     path, since = path_by_poses(view, name, binned.counted)
-    if path is None:
+    if path is None or not path.poses:
         raise no_path(view, name, asked)
     binned.count_since(since)
     total_m = path.totals.distance_m

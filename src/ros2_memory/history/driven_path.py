@@ -30,6 +30,7 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
+    NoDataReason,
     UndecodableError,
 )
 from ros2_memory.core.memo import Key
@@ -40,12 +41,13 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
+    no_data_between,
     resolve_pose_topic,
     undecodable,
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows
-from ros2_memory.history.robots import no_poses_between, parallel_or_twice
+from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import (
     blocks,
     joined_back,
@@ -546,21 +548,34 @@ def newest_of_body(
 
 
 def no_path(view: View, topic: str, window: TimeWindow) -> NoDataError:
-    """Returns the error for a window in which a topic has no pose.
+    """Returns the error for a window without a pose that counts for a path.
 
-    If it has transforms there, the error says why these do not place the robot's body.
+    In a file in which the clock was set back, no pose of a time that it has twice counts.
     """
-    newest = None
-    if topic in view.limits.tf_topics:
-        newest = view.stream.first(view.moving_topics, window, newest_first=True)
-    body = None if newest is None else body_at(view, newest.time)
-    if newest is None or body is None:
-        return no_poses_between(view, topic, window)
-    try:
-        transform_at(view, body.odometry, body.child, newest.time, newest.bag.recording)
-    except NoDataError as error:
-        return with_notes(view, window, error)
-    return no_poses_between(view, topic, window)
+    twice = [pair for pair in parallel_or_twice(view, topic, window) if pair.is_twice]
+    if twice:
+        return NoDataError(
+            NoDataReason.MIXED,
+            f"{twice[0].describe_by_clock(topic)}: which poses belong to one path is not known; "
+            "get_topic_in_range has the messages",
+        )
+    is_body = topic in view.limits.tf_topics
+    topics = view.moving_topics if is_body else (topic,)
+    newest = view.stream.first(topics, window, newest_first=True)
+    body = body_at(view, newest.time) if newest is not None and is_body else None
+    if newest is None or (is_body and body is None):
+        return no_data_between(view, (topic,), window)
+    lack = "has a valid position"
+    if body is not None:
+        lack = f"places {body.child}"
+        try:
+            transform_at(view, body.odometry, body.child, newest.time, newest.bag.recording)
+        except NoDataError as error:
+            if error.reason is NoDataReason.FRAME_UNKNOWN:
+                return with_notes(view, window, error)
+    start, end = map(unix_text, window.asked())
+    detail = f"no message of {topic} between {start} and {end} {lack}"
+    return with_notes(view, window, NoDataError(NoDataReason.GAP, detail))
 
 
 def rows_of_body(view: View, window: TimeWindow) -> Iterator[PoseRows]:

@@ -382,9 +382,14 @@ def no_data_at(
     is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
     holds_on = older and tolerance is not None and _may_hold_on(view, older, at)
     if older and (is_near or holds_on) and not _describe_future(view, at):
-        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
-        detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
+        detail.append(accepting(older, at))
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def accepting(older: StoredMessage, at: Ns) -> str:
+    """Returns how to ask so that a message before a moment answers."""
+    enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
+    return f"to accept the older one, ask with tolerance_s of at least {enough:.3f}"
 
 
 def _may_hold_on(view: View, older: StoredMessage, at: Ns) -> bool:

@@ -23,7 +23,6 @@ from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import loose_bags_beside_others, recordings_of
@@ -267,21 +266,6 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     for pair in parallel:
         before = "files from before" if pair.is_twice else pair.first.name
         view.notes.add(f"{pair.describe_by_clock(topic)}: the path there is that of {before}")
-
-
-def no_poses_between(view: View, topic: str, window: TimeWindow) -> NoDataError:
-    """Returns the error for a window without a pose that counts for a path.
-
-    In a file in which the clock was set back, no pose of a time that it has twice counts.
-    """
-    twice = [pair for pair in parallel_or_twice(view, topic, window) if pair.is_twice]
-    if not twice:
-        return no_data_between(view, (topic,), window)
-    return NoDataError(
-        NoDataReason.MIXED,
-        f"{twice[0].describe_by_clock(topic)}: which poses belong to one path is not known; "
-        "get_topic_in_range has the messages",
-    )
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
