@@ -84,7 +84,15 @@ def count_path(
         metres_before = path.line.metres_at(edges) if len(path.line) else np.zeros(len(edges))
     # Rounded to a micrometre: differences of sums may be off from 0 by less.
     metres = np.diff([0.0, *metres_before.tolist(), total_m]).round(6)
-    binned.add("metres", "metres", (metres @ binned.bins.member).tolist(), total_m)
+    of_bins: list[float | None] = (metres @ binned.bins.member).tolist()
+    if by != "place":
+        # The path has a vertex in each of its slices, and so in each bin with a pose.
+        vertices = np.bincount(binned.bins.pieces(path.line.times), minlength=len(metres))
+        are_known = vertices @ binned.bins.member > 0
+        of_bins = [
+            one if is_known else None for one, is_known in zip(of_bins, are_known, strict=True)
+        ]
+    binned.add("metres", "metres", of_bins, total_m)
     require_one_robot(view, name, asked)
     return binned.answer()
 

@@ -155,6 +155,23 @@ NESTED = (
 )
 
 
+@each_way
+def test_an_hour_without_poses_has_no_metres_one_in_which_the_robot_stands_has_zero(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It drives for an hour, has no odometry for an hour, and stands for an hour."""
+    begin = 1_784_001_600
+    messages = [boolean((begin + t) * S, True) for t in range(0, 3 * H, 5)]
+    messages += [odom((begin + t) * S, t * 0.01) for t in range(0, H, 5)]
+    messages += [odom((begin + t) * S, 36.0) for t in range(2 * H, 3 * H, 5)]
+    write_splits(tmp_path, messages, 600)
+    memory = memory_of(tmp_path, recalls=recalls)
+    with in_zone("UTC"):
+        window = {"start": begin, "end": begin + 3 * H - 1, "by": "hour"}
+        rows = asked(memory, "trajectory_summary", **window)["rows"]
+    assert [row[-1] for row in rows] == [pytest.approx(36, abs=0.1), None, 0.0]
+
+
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 1, seconds=300)
     memory = memory_of(tmp_path, limits=QuerySettings(places=NESTED), recalls=True)
