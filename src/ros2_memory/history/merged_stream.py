@@ -164,8 +164,12 @@ class MergedStream:
                 yield stored
 
     def _count_copies(self, topic: str, part: TimeWindow) -> Counter[_MessageKey]:
-        """Returns how many messages with each key are copies, in a part of a topic."""
-        around = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
+        """Returns how many messages with each key are copies, in a part of a topic.
+
+        What was received shortly before decides, and for that what was received before it: as much
+        is compared as by `Scan`.
+        """
+        around = TimeWindow(max(part.start - 2 * COPY_HORIZON_NS, MIN_NS), part.stop)
         extents = self.overlapping_bags([topic], around)
         recordings = sorted({str(extent.bag.recording) for extent in extents})
         number_of = {recording: number for number, recording in enumerate(recordings)}

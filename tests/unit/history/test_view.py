@@ -27,6 +27,7 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
+    text,
     write_mcap,
 )
 from tests.support.column_worlds import EVERYTHING
@@ -146,6 +147,24 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         last = View(memory, Call()).stream.newest(TOPIC, EVERYTHING)
         assert last is not None
         assert last.time == counted[-1][0]
+
+
+@each_way
+def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_way(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The third one is 2.1 s after the first, and 1.9 s after a copy, which counts for nothing."""
+    for name, at_s in (("one", 1.9), ("two", 2.1), ("three", 4.0)):
+        moved = text(T0 + S, "moved")
+        received = replace(moved, log_time=T0 + round(at_s * S), publish_time=T0 + S)
+        around = [text(T0 - 5 * S, f"{name} begins"), text(T0 + 20 * S, f"{name} ends")]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [around[0], received, around[1]])
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"topic": "/chatter", "start": T0 / S + 1, "end": T0 / S + 5}
+    shown = asked(memory, "get_topic_in_range", **window)["samples"]
+    assert [sample["timestamp"] for sample in shown] == [T0 / S + 1.9, T0 / S + 4]
+    reply = asked(memory, "get_topic_at_time", topic="/chatter", timestamp=T0 / S + 4)
+    assert reply["timestamp"] == T0 / S + 4
 
 
 def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
