@@ -109,6 +109,7 @@ class Sessions:
         self._recordings = view.timeline.memo.of(_RECORDINGS, dict)
         self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
         self._static: dict[Session, Sequence[StampedTransform]] = {}
+        self._looked_up = 0  # sessions whose static transforms were not cached
         self._lending: dict[tuple[str, Ns], Session] = {}
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.linked = view.timeline.memo.of(_LINKED, set)
@@ -381,9 +382,10 @@ class Sessions:
         known = dict(cached) if timeline is view.timeline else {}
         if session not in known:
             noted = view.notes.added
-            if len(self._static) == _FEW_SESSIONS and not view.call.stored:
+            if self._looked_up == _FEW_SESSIONS and not view.call.stored:
                 # A call that asks for so many asks for more.
                 known = {**self._all_static(), **known}
+            self._looked_up += 1
             if session not in known:
                 received = (self._static_received(topic, session) for topic in view.static_topics)
                 known[session] = _without_repeats(chain.from_iterable(received))

@@ -5,6 +5,7 @@ from itertools import count, groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.frames import static_at
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
+from ros2_memory.history import sessions
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
@@ -93,6 +95,26 @@ def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_
     named = {100.0: first, 500.0: second}[found["translation"]["x"]]
     [note] = [note for note in found["notes"] if "2 sessions" in note]
     assert note.endswith(f"this is that of {named}")
+
+
+def test_a_call_that_needs_many_recordings_looks_up_all_at_once_whatever_an_earlier_one_did(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for nth in range(9):
+        begin = T0 + nth * 1000 * S
+        mounted = fixed(begin, "base_link", "laser", 0.1 + nth)
+        record(tmp_path / f"rec{nth:02}", [mounted, *drive(begin, 5)])
+    memory = memory_of(tmp_path, recalls=True)
+    looked_up = Mock(wraps=sessions.scan)
+    monkeypatch.setattr(sessions, "scan", looked_up)
+    for wanted in (range(4), range(4, 9)):
+        looked_up.reset_mock()
+        view = View(memory, Call())
+        recordings = sorted(view.timeline.recordings("/tf_static"))
+        for nth in wanted:
+            [static] = view.sessions.static(view.sessions.session_of(recordings[nth]))
+            assert static.transform.translation[0] == 0.1 + nth
+        assert looked_up.call_count == 4
 
 
 @pytest.mark.parametrize("gap", [S // 5, 5 * S, 15 * S])
