@@ -51,6 +51,8 @@ _MAX_TREES: Final = 32
 """The static transforms of so many recordings are compared, the newest."""
 _MAX_STATIC: Final = 50
 """At most so many messages of static transforms are read of a recording."""
+MOST_REMEMBERED: Final = 1_000
+"""So many comparisons of two recordings are remembered: each window of a question is one."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 _OWN: Final[Key[frozenset[Path]]] = Key()
@@ -144,7 +146,10 @@ def _contradicting_frames(view: View) -> Iterator[str]:
     """Yields a sentence on each static frame that has different parents in two recordings."""
     remembered = view.memory.memo.of(_TREES, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    for path, bags in _recordings_to_compare(view):
+    recordings = _recordings_to_compare(view)
+    for path in {*remembered} - dict(recordings).keys():
+        remembered.pop(path, None)
+    for path, bags in recordings:
         files = hash(tuple(bag.identity for bag in bags))
         tree = remembered.get(path)
         try:
@@ -476,8 +481,9 @@ def _misdated(view: View) -> frozenset[Path]:
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
     """Whether two recordings hold different messages in a window."""
     remembered, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
-    if key in remembered:
-        return remembered[key]
+    known = remembered.get(key)
+    if known is not None:
+        return known
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
     loose = loose_bags_beside_others(view.snapshot)
@@ -486,6 +492,8 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     )
     differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
+        if len(remembered) >= MOST_REMEMBERED:
+            remembered.clear()
         remembered[key] = differ
     return differ
 

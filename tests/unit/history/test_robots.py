@@ -52,6 +52,21 @@ def test_what_is_read_to_tell_robots_apart_says_nothing_of_the_answer(tmp_path: 
     assert (view.notes.complete, view.notes.sentences()) == (True, ())
 
 
+def test_what_is_remembered_of_comparisons_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        record(tmp_path, robot, drive(10.0 * number))
+    memory = memory_of(tmp_path)
+    monkeypatch.setattr(robots, "MOST_REMEMBERED", 4)
+    for nth in range(40):
+        window = {"start": T0_S + nth / 4, "end": T0_S + 20 + nth / 4}
+        reply = asked(memory, "get_topic_in_range", topic="/odom", max_samples=2, **window)
+        assert MIXED.search(str(reply["notes"]))
+    differing = memory.snapshot().timeline.memo.of(robots._DIFFERING, dict)
+    assert len(differing) <= 4
+
+
 @pytest.fixture(scope="module", params=["{0}/{0}_0", "{0}", "{0}_0"])
 def both(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Memory:
     """The bags of two robots that drive at once, 10 m apart: in a folder each, or in one."""
