@@ -201,6 +201,7 @@ class BagAccess:
                     self.check_deadline()
                 yield StoredMessage(bag, record)
                 begin = clock()
+            spent += clock() - begin
         finally:
             self.call.stages.add("read", spent)
 

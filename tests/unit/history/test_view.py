@@ -2,7 +2,8 @@
 
 import os
 import random
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
+from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -209,6 +211,24 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     for nth in range(0, 50, 6):
         found = asked(memory, "find_matches", **wanted, value=4_000 * nth + 700)
         assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]
+
+
+def test_the_time_after_the_last_message_of_a_bag_is_time_of_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The reader takes a second to find that there are no more."""
+    now = [0]
+
+    class Slow(NotingReader):
+        def records(self, *args: Any, **given: Any) -> Iterator[Record]:
+            yield from super().records(*args, **given)
+            now[0] += S
+
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(T0)])
+    view = View(memory_of(tmp_path, reader=Slow()), Call())
+    monkeypatch.setattr(time, "perf_counter_ns", lambda: now[0])
+    assert len([*view.stream.messages(["/odom"], TimeWindow.everything())]) == 1
+    assert view.call.stages.spent["read"] == S
 
 
 def test_the_newest_message_of_a_silent_topic_is_read_without_the_time_after_it(
