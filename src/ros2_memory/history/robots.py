@@ -311,7 +311,13 @@ def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[Parall
     """
     parallel: list[ParallelRecordings] = []
     if topic not in view.timeline.transient_local:
-        parallel += _parallel_recordings(view, topic, window) or ()
+        differing = _parallel_recordings(view, topic, window)
+        if differing is None:
+            view.notes.add(
+                f"not compared: whether recordings of one time have different messages on {topic}, "
+                "as of several robots"
+            )
+        parallel += differing or ()
     holding = view.timeline.recordings(topic)
     parallel += (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
     return parallel

@@ -4,11 +4,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
@@ -75,6 +77,14 @@ def both(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReques
         name = str(request.param).format(robot)
         write_mcap(folder / f"{name}.mcap", drive(10.0 * number))
     return memory_of(folder)
+
+
+def test_robots_that_there_is_no_time_to_tell_apart_are_no_single_one(
+    both: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(robots, "_bags_differ", Mock(side_effect=QueryTimeoutError("late")))
+    reply = asked(both, "get_topic_in_range", topic="/odom", start=T0_S + 7, end=T0_S + 9)
+    assert "not compared: whether recordings of one time have different" in str(reply["notes"])
 
 
 def driven(memory: Memory, start: int, stop: int) -> Any:
