@@ -58,16 +58,18 @@ class TimeWindow:
     stop: Ns
 
     @classmethod
-    def from_unix(cls, start_s: float, end_s: float) -> TimeWindow:
+    def from_unix(cls, start_s: float | None, end_s: float | None) -> TimeWindow:
         """Returns the window of an inclusive query `[start_s, end_s]` in Unix seconds.
 
-        Both bounds are granted the tolerance of a float of seconds (see `timebase`).
+        Bounds are granted the tolerance of a float of seconds (see `timebase`). None leaves an end
+        open: it is `MIN_NS` or `MAX_NS`.
 
         Raises:
             InvalidArgumentsError: a bound is not finite, or the start is after the end.
         """
         try:
-            start, end = ns_from_unix(start_s), ns_from_unix(end_s)
+            start = MIN_NS if start_s is None else ns_from_unix(start_s)
+            end = MAX_NS if end_s is None else ns_from_unix(end_s)
         except ValueError as error:
             raise InvalidArgumentsError(
                 f"the window's bounds must be Unix seconds: {error}"

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
+from decimal import Decimal
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -382,7 +383,10 @@ def seconds(duration: Ns) -> str:
     length = unix_from_ns(duration)
     if duration > LONGEST_OFF_NS:
         return f"{length / 86_400:.0f} days"
-    return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
+    if length >= 100:
+        return f"{length:.0f} s"
+    # Without an exponent, which .3g has below 0.1 ms.
+    return f"{Decimal(f'{length:.3g}'):f} s"
 
 
 def unix_text(at: Ns) -> str:

@@ -301,15 +301,14 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
     """Returns the view for a window, and the window.
 
     Raises:
-        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
+        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, or both
+            kinds of bounds are given.
         NoDataError: nothing is recorded.
     """
-    if span.last_s is not None:
-        length = ns_argument("seconds", span.last_s)
-        if length <= 0:
-            raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
+    length = _length_asked(span)
+    if length is not None:
         view, now = _open_now(memory, call, 0)
-        window = last_window(now, length)
+        window = _last_window(now, length)
     else:
         if span.start_s is None or span.end_s is None:
             raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
@@ -320,29 +319,34 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
     return view, window
 
 
-def last_window(now: Ns, length: Ns) -> TimeWindow:
+def search_window(span: TimeRange, now: Ns) -> TimeWindow:
+    """Returns the window to search; an end that is not given is open (`MIN_NS`, `MAX_NS`).
+
+    Raises:
+        InvalidArgumentsError: as for `open_span`.
+    """
+    length = _length_asked(span)
+    if length is not None:
+        return _last_window(now, length)
+    return TimeWindow.from_unix(span.start_s, span.end_s)
+
+
+def _length_asked(span: TimeRange) -> Ns | None:
+    """Returns how far back from now a range reaches; None if it has bounds."""
+    if span.last_s is None:
+        return None
+    if span.start_s is not None or span.end_s is not None:
+        raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
+    length = ns_argument("seconds", span.last_s)
+    if length <= 0:
+        raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
+    return length
+
+
+def _last_window(now: Ns, length: Ns) -> TimeWindow:
     """Returns the window of a length (ns) up to now, with the slack of floats of seconds."""
     start = now - length - START_SLACK_NS
     return TimeWindow(max(start, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
-
-
-def search_window(span: TimeRange, now: Ns) -> TimeWindow:
-    """Returns the window to search, with the slack of floats of seconds.
-
-    Raises:
-        InvalidArgumentsError: the end lies before the start, or a bound is not finite, or both
-            kinds of bounds are given.
-    """
-    start_s, end_s = span.start_s, span.end_s
-    if span.last_s is not None:
-        if start_s is not None or end_s is not None:
-            raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
-        return last_window(now, ns_argument("seconds", span.last_s))
-    start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
-    end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
-    if end < start:
-        raise InvalidArgumentsError(f"end ({end_s}) is before start ({start_s})")
-    return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
 
 
 def clamped(view: View, window: TimeWindow) -> TimeWindow:

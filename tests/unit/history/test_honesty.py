@@ -30,10 +30,11 @@ from ros2_memory.bag_dir.state_files import (
     ScreenState,
     append_losses,
 )
-from ros2_memory.core.errors import NoDataReason
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataReason
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.coverage import unread_spans
+from ros2_memory.history.view import TimeRange
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from tests.support import bags
@@ -54,7 +55,7 @@ from tests.support.clocks import FixedClock, SettableClock
 from tests.support.heartbeats import beat
 from tests.support.listed_bags import odom_bag
 from tests.support.mcap_surgery import chunks_of, spoil_chunk
-from tests.support.memories import asked, each_way, memory_of, replied, with_store
+from tests.support.memories import asked, each_way, memory_of, remembered, replied, with_store
 from tests.unit.history.test_any_cut import questions
 
 S = 10**9
@@ -506,6 +507,24 @@ def test_a_window_without_recording_is_not_answered_as_never(
     told = asked(memory, tool, **WINDOWED[tool], start=start, end=end)
     assert (told["error"], told["reason"]) == ("no_data", reason)
     assert "the memory covers" in told["detail"]
+
+
+def test_a_short_time_is_said_in_seconds_without_an_exponent(tmp_path: Path) -> None:
+    memory = remembered(tmp_path, [text(T0, "on"), text(T0 + 20_000, "off"), text(T0 + S, "on")])
+    asks = {"topic": "/chatter", "timestamp": T0_S + 0.00002, "tolerance_s": 0.000001}
+    assert asked(memory, "get_topic_at_time", **asks)["value"] == {"value": "off"}
+    told = asked(memory, "get_topic_at_time", **asks | {"timestamp": T0_S + 0.00001})["detail"]
+    assert "the nearest older one is 0.00001 s before it" in told
+
+
+def test_seconds_and_bounds_of_a_window_are_not_given_both(memory: Memory) -> None:
+    span = TimeRange(start_s=T0_S, end_s=T0_S + 9.0, last_s=5.0)
+    ask = partial(queries.trajectory_summary, memory, Call())
+    for given_ in (span, TimeRange(last_s=0.0), TimeRange(last_s=-5.0), TimeRange(end_s=1.0)):
+        with pytest.raises(InvalidArgumentsError):
+            ask(given_)
+    with pytest.raises(InvalidArgumentsError, match="give it, or start and end"):
+        ask(span)
 
 
 def test_a_moment_in_a_gap_is_not_between_messages_of_a_slow_topic(tmp_path: Path) -> None:
