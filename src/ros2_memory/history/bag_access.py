@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -42,6 +43,17 @@ _AWAY: Final = Reason(
 _CONTRADICTS_ITSELF: Final = Reason("contradicts itself", "bag", many="contradict themselves")
 _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
+
+
+class Reading:
+    """How a part of a call read bags.
+
+    Attributes:
+        is_final: whether all that it needed could be read, of bags that are closed. Then what
+            follows from it may be remembered.
+    """
+
+    is_final = False
 
 
 class BagAccess:
@@ -92,6 +104,20 @@ class BagAccess:
                 f"the question needs more than {budget_s:g} s; {self.filling_progress()}"
                 "ask about a shorter window or a single topic"
             )
+
+    @contextmanager
+    def watched(self) -> Iterator[Reading]:
+        """Watches what the block reads; what failed before it does not count."""
+        notes, call, reading = self.notes, self.call, Reading()
+        complete, added, used_active = notes.complete, notes.added, call.used_active
+        notes.complete, call.used_active = True, False
+        try:
+            yield reading
+            could_read_all = notes.complete and notes.added == added
+            reading.is_final = could_read_all and not call.used_active
+        finally:
+            notes.complete &= complete
+            call.used_active |= used_active
 
     def filling_progress(self) -> str:
         """Returns a clause on the bags that are not stored as columns, for a lack of time.

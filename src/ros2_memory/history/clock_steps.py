@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.poses import pose_rows
@@ -199,11 +199,10 @@ def _steps_of_pause(view: View, pause: Pause) -> tuple[ClockStep, ...]:
     cache = view.memory.scanner.caches.clock_steps
     steps = cache.get(key)
     if steps is None:
-        with view.notes.isolated():
+        with view.bags.watched() as reading:
             step = _find_step(view, topic, pause)
-            is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         steps = () if step is None else (step,)
-        if is_final:
+        if reading.is_final:
             cache.put(key, steps, _STEPS_BYTES)
     return steps
 

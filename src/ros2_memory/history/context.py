@@ -443,18 +443,6 @@ class Notes:
         self.add(note)
 
     @contextmanager
-    def isolated(self) -> Iterator[None]:
-        """Within the block, `complete` starts as True, and is about the block alone.
-
-        So a result is remembered if all of its own bags could be read, whatever failed before.
-        """
-        before, self.complete = self.complete, True
-        try:
-            yield
-        finally:
-            self.complete = self.complete and before
-
-    @contextmanager
     def apart(self) -> Iterator[None]:
         """Within the block, what is noted of files, and `complete`, is not of the answer.
 

@@ -490,14 +490,14 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     known = remembered.get(key)
     if known is not None:
         return known
-    noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
     loose = loose_bags_beside_others(view.snapshot)
     first, other = (
         [extent for extent in near if _recording_of(extent.bag, loose) == path] for path in pair
     )
-    differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
-    if view.notes.added == noted:  # else something could not be read, and may be next time
+    with view.bags.watched() as reading:
+        differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
+    if reading.is_final:
         if len(remembered) >= MOST_REMEMBERED:
             remembered.clear()
         remembered[key] = differ

@@ -180,12 +180,14 @@ def remembered(
     It is not remembered if something could not be read meanwhile, or if the key is None: then it
     may still change. `also_before` is as in `Fragments.get`.
     """
+    if key is None:
+        return make()
     fragments = view.memory.scanner.fragments(kind)
-    fragment = None if key is None else fragments.get(key, also_before)
+    fragment = fragments.get(key, also_before)
     if fragment is None:
-        before = view.notes.added
-        fragment = make()
-        if key is not None and view.notes.added == before:
+        with view.bags.watched() as reading:
+            fragment = make()
+        if reading.is_final:
             fragments.put(key, fragment)
     return fragment
 

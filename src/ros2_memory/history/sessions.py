@@ -381,16 +381,15 @@ class Sessions:
         timeline, cached = cache.get(view.static_topics) or (None, {})
         known = dict(cached) if timeline is view.timeline else {}
         if session not in known:
-            noted = view.notes.added
-            if self._looked_up == _FEW_SESSIONS and not view.call.stored:
-                # A call that asks for so many asks for more.
-                known = {**self._all_static(), **known}
-            self._looked_up += 1
-            if session not in known:
-                received = (self._static_received(topic, session) for topic in view.static_topics)
-                known[session] = _without_repeats(chain.from_iterable(received))
-            # A note has to be in each answer, so what it is about is not cached.
-            if view.notes.added == noted and not view.call.used_active:
+            with view.bags.watched() as reading:
+                if self._looked_up == _FEW_SESSIONS and not view.call.stored:
+                    # A call that asks for so many asks for more.
+                    known = {**self._all_static(), **known}
+                self._looked_up += 1
+                if session not in known:
+                    received = (self._static_received(each, session) for each in view.static_topics)
+                    known[session] = _without_repeats(chain.from_iterable(received))
+            if reading.is_final:  # else a note has to be in each answer
                 size = 300 * len(known) + 500 * sum(map(len, known.values()))
                 cache.put(view.static_topics, (view.timeline, known), size)
         self._static |= known
@@ -532,16 +531,15 @@ class Sessions:
         pairs = None if part is None else cache.get(part)
         if pairs is not None:
             return pairs
-        noted = view.notes.added
         by_columns = None
-        if session is None:
-            by_columns = of_columns(view, rows, lambda read: pairs_in(read.table, read.index))
-        if by_columns is None:
-            received = self.received(session, rows)
-            pairs = frozenset((transform.parent, transform.child) for transform in received)
-        else:
-            pairs = frozenset[Pair]().union(*by_columns)
-        if part is not None and view.notes.added == noted:
+        with view.bags.watched() as reading:
+            if session is None:
+                by_columns = of_columns(view, rows, lambda read: pairs_in(read.table, read.index))
+            if by_columns is None:
+                received = self.received(session, rows)
+                by_columns = [frozenset((found.parent, found.child) for found in received)]
+        pairs = frozenset[Pair]().union(*by_columns)
+        if part is not None and reading.is_final:
             cache.put(part, pairs, 200 + 200 * len(pairs))
         return pairs
 

@@ -182,11 +182,10 @@ class View:
         remembered = self.timeline.memo.of(_CENSUSES, dict)
         if topic in remembered:
             return remembered[topic]
-        noted = self.notes.added
-        with self.notes.isolated():
+        with self.bags.watched() as reading:
             census = self._read_census(topic)
-            if self.notes.complete and self.notes.added == noted and not self.call.used_active:
-                remembered[topic] = census
+        if reading.is_final:
+            remembered[topic] = census
         return census
 
     def _read_census(self, topic: str) -> dict[str, TopicTotals]:

@@ -233,14 +233,14 @@ class TrackReader:
             return None
         known = self._view.timeline.memo.of(_SETTINGS, dict)
         known_by = (self._settings_hash(()), stretch.parts, *recording_of_part)
-        notes_before = self._view.notes.added
         settings = known.get(known_by)
         if settings is None:
             recordings = [] if self._is_own else [*map(pose_scan.recording_of, stretch.parts)]
-            settings = self._stretch_settings(recordings, recording_of_part.values(), span)
+            with self._view.bags.watched() as reading:
+                settings = self._stretch_settings(recordings, recording_of_part.values(), span)
             if settings is None:
                 return None
-            if self._view.notes.added == notes_before and not self._view.call.used_active:
+            if reading.is_final:
                 if len(known) >= _MOST_SETTINGS:
                     known.clear()
                 known[known_by] = settings

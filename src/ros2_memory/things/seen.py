@@ -439,9 +439,9 @@ class SightReader:
         cached = cache.get(key)
         if cached is not None:
             return cast("Seen", cached)
-        notes_before = self._view.notes.added
-        seen = self._read(around)
-        if self._view.notes.added == notes_before:
+        with self._view.bags.watched() as reading:
+            seen = self._read(around)
+        if reading.is_final:
             cache.put(key, seen, seen.memory_bytes + 100 * len(bags))
         return seen
 
