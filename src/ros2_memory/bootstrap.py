@@ -771,8 +771,12 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
                 "/metrics; choose server.transport=sse or leave it out"
             )
         require_extra("server.metrics: true", "observability", "prometheus_client")
+        from prometheus_client import disable_created_metrics
+
         from ros2_memory.observability.prometheus import MemoryGauges, Metrics
 
+        # Series of when each counter began, which this format has no use for, in all registries.
+        disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
         metrics = Metrics(MemoryGauges(memory), package_version())
         observers.append(metrics)
         exposition = metrics.exposition

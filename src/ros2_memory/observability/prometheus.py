@@ -18,12 +18,12 @@ from prometheus_client import (
     CollectorRegistry,
     Counter,
     Histogram,
-    disable_created_metrics,
 )
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import generate_latest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import Answered, Exposition, Observer
 from ros2_memory.core.timebase import Ns, unix_from_ns
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 TIMEOUT_S: Final = 2.0
 """How long measuring the gauges may take; after that a scrape gets the counters alone."""
 BUCKETS_S: Final = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0)
+
+_log = get_logger(__name__)
 
 
 class Metrics(Observer):
@@ -58,8 +60,6 @@ class Metrics(Observer):
         self._timeout_s = timeout_s
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="metrics")
         self._measuring: asyncio.Future[Sequence[Metric]] | None = None
-        # They are one more series for each counter, of no use in this format.
-        disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
         self._gauges: Sequence[Metric] = ()
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
@@ -89,16 +89,26 @@ class Metrics(Observer):
     async def exposition(self) -> Exposition:
         """Returns all metrics in Prometheus' text format, version 0.0.4.
 
-        The gauges of the memory are missing if measuring them takes longer than the timeout.
+        The gauges of the memory are missing if measuring them fails, or takes longer than the
+        timeout.
         """
-        gauges: Sequence[Metric] = ()
-        with anyio.move_on_after(self._timeout_s), suppress(RuntimeError):  # it has stopped
-            if self._measuring is None or self._measuring.done():
+        if self._measuring is None or self._measuring.done():
+            with suppress(RuntimeError):  # the thread was stopped
                 loop = asyncio.get_running_loop()
-                self._measuring = loop.run_in_executor(self._thread, self._measure)
-            gauges = await asyncio.shield(self._measuring)
-        self._gauges = gauges
+                self._measuring = loop.run_in_executor(self._thread, self._measured)
+        self._gauges = ()
+        with anyio.move_on_after(self._timeout_s):
+            if self._measuring is not None:
+                self._gauges = await asyncio.shield(self._measuring)
         return Exposition(CONTENT_TYPE_PLAIN_0_0_4, generate_latest(self._registry))
+
+    def _measured(self) -> Sequence[Metric]:
+        """Returns the gauges; none if measuring them fails, which is logged."""
+        try:
+            return self._measure()
+        except Exception:  # noqa: BLE001 - it must not cost the counters
+            _log.exception("metrics_not_measured")
+            return ()
 
     def collect(self) -> Iterator[Metric]:
         """Yields the version and the gauges of the memory, for the registry."""

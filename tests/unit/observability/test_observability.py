@@ -3,16 +3,19 @@
 Gauges of a memory are measured without a look at its bags.
 """
 
+import errno
 import threading
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 from mcp import Client, MCPError
 from opentelemetry.sdk.trace import ReadableSpan
 from prometheus_client.metrics_core import Metric
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
@@ -33,6 +36,12 @@ pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
 from opentelemetry import trace
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    enable_created_metrics,
+    generate_latest,
+)
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -96,6 +105,29 @@ async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None
     finally:
         freed.set()
         metrics.stop()
+
+
+@pytest.mark.parametrize("fault", [RuntimeError("a bug"), OSError(errno.EIO, "no disk")])
+async def test_a_measurement_that_fails_is_logged_and_costs_the_figures_of_the_memory_alone(
+    fault: Exception,
+) -> None:
+    metrics = Metrics(Mock(side_effect=fault), "1")
+    metrics.answered(Answered("ask", "ok", 0.03, 12, "abc", {}))
+    with capture_logs() as captured:
+        found = await scraped(metrics)
+    assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 1
+    assert [event["event"] for event in captured] == ["metrics_not_measured"]
+    metrics.stop()
+    # As a scrape may find it while the server ends.
+    assert at(await scraped(metrics), "build_info", version="1") == 1
+
+
+def test_metrics_of_other_libraries_stay_as_they_are() -> None:
+    enable_created_metrics()  # type: ignore[no-untyped-call]
+    registry = CollectorRegistry()
+    Counter("other", "Of another library.", registry=registry)
+    Metrics(lambda: (), "1").stop()
+    assert "other_created" in generate_latest(registry).decode()
 
 
 def measured(gauges: MemoryGauges) -> dict[str, float]:
