@@ -169,16 +169,15 @@ def _cluster_places(xy_mm: Ints) -> tuple[Ints, Floats]:
     A position joins the nearest place within a metre, else it begins a new one.
     """
     numbers = np.zeros(len(xy_mm), np.int64)
-    sums: list[Floats] = []  # x, y and the number of positions of each place
+    totals = np.zeros((len(xy_mm), 3))  # x, y and the number of positions of each place
+    size = 0
     for row, position in enumerate(xy_mm):
-        apart = [math.dist(xyn[:2] / xyn[2], position) for xyn in sums]
-        place = int(np.argmin(apart)) if apart and min(apart) <= _ONE_PLACE_MM else len(sums)
-        if place == len(sums):
-            sums.append(np.zeros(3))
-        sums[place] += (*position, 1.0)
+        apart = np.hypot(*(totals[:size, :2] / totals[:size, 2:] - position).T)
+        place = int(np.argmin(apart)) if size and apart.min() <= _ONE_PLACE_MM else size
+        size = max(size, place + 1)
+        totals[place] += (*position, 1.0)
         numbers[row] = place
-    totals = np.array(sums)
-    return numbers, totals[:, :2] / totals[:, 2:]
+    return numbers, totals[:size, :2] / totals[:size, 2:]
 
 
 def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
