@@ -94,6 +94,8 @@ _EVERYTHING: Final = TopicSelection((*("/*" * n for n in range(1, 12)), "/*/_act
 _OWN: Final = re.compile(r"^/(rosout|parameter_events)$|^/events/|^/rosbag2_|^/ros2_memory_up")
 """Topics that every recorder offers itself."""
 _LOGGING: Final = ("logging.level=warning", "logging.format=pretty")
+_SET_BY_UNITS: Final = re.compile(r"deployment=robot$|recording\.(bag_dir|topics_file)=")
+"""Settings that the installed services have."""
 
 
 class Survey(NamedTuple):
@@ -332,7 +334,8 @@ def _install_script() -> Path:
 
 def _become_installer(script: Path, robot: _Robot) -> None:
     """Replaces this process by deploy/install.sh, which installs services for this list."""
-    print_line(f"to be set in /etc/ros2-memory/environment: {robot.words[-1]}")
+    words = [word for word in robot.words if not _SET_BY_UNITS.match(word)]
+    print_line(f"to be set in /etc/ros2-memory/environment: {' '.join(words)}")
     program = "sudo" if os.geteuid() else "env"
     argv = [program, f"PYTHON={sys.executable}", str(script), "--topics", str(robot.list_file)]
     print_line(" ".join(argv))
