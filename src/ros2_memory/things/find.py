@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Spot, bin_of
+from ros2_memory.analysis.sights import SCORE_BINS, STOREY_MM, Spot, bin_of
 from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
@@ -228,9 +228,9 @@ class Near(NamedTuple):
     ) -> Iterator[_FoundThing]:
         """Yields the things near the circle's middle, or near a landmark, with their distances."""
         for thing in things:
-            points = self._points_for(thing, landmarks)
             near: list[tuple[float, Vector3]] = []
             for place in thing.places:
+                points = self._points_for(thing, place, landmarks)
                 away_m = min((math.dist(place[:2], point) for point in points), default=math.inf)
                 if away_m <= self.circle.radius_m:
                     near.append((away_m, place))
@@ -243,16 +243,20 @@ class Near(NamedTuple):
             yield thing._replace(near_m=near_m, place=place, at_once=at_once)
 
     def _points_for(
-        self, thing: _FoundThing, landmarks: Sequence[_FoundThing]
+        self, thing: _FoundThing, place: Vector3, landmarks: Sequence[_FoundThing]
     ) -> list[tuple[float, float]]:
-        """Returns the points (m) that a thing may be near: no thing is near itself."""
+        """Returns the points (m) that a thing at a place may be near.
+
+        No thing is near itself, or near one on another floor.
+        """
         if not self.label:
             return [(self.circle.x, self.circle.y)]
         return [
             (x, y)
             for landmark in landmarks
             if landmark.thing is not thing.thing and landmark.thing.epoch == thing.thing.epoch
-            for x, y, _ in landmark.places
+            for x, y, z in landmark.places
+            if abs(z - place[2]) * 1000 <= STOREY_MM
         ]
 
     def describe_lack(

@@ -375,6 +375,18 @@ def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[See
         assert since["mug"] == {"seen_since": last}
 
 
+def test_what_is_on_another_floor_is_not_near_a_thing(tmp_path: Path) -> None:
+    seen = [("cup", 0.9, (2.0, 0.0, 0.7)), ("book", 0.9, (2.3, 0.0, 1.4))]
+    above = [("lamp", 0.9, (2.2, 0.0, 4.9)), ("cup", 0.9, (2.0, 0.0, 4.9))]
+    messages: list[Msg] = []
+    for second in range(60):
+        *robot, _ = scene(second, (0.0, 0.0, 0.0), [], in_map=False)
+        messages += [*robot, detected((BEGIN + second) * S, [*seen, *above])]
+    things = told_of(tmp_path, messages, near={"label": "cup", "radius_m": 1})["things"]
+    near = {(thing["label"], thing["place"]["z"], thing["near_m"]) for thing in things}
+    assert near == {("book", 1.4, 0.3), ("lamp", 4.9, 0.2)}
+
+
 def test_people_are_counted_in_the_region_that_is_asked_for(tmp_path: Path) -> None:
     people = [("person", x, 0.0) for x in (2.0, 6.0, 8.0)]
     write_splits(tmp_path, looked(0, 60, HERE, *people, ("cup", 8.3, 0.0)))
