@@ -154,7 +154,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif is_empty:
         _print_nothing(memory)
     else:
-        print_reply({"recordings": [*rows], "not_read": [*not_read]})
+        print_reply({"recordings": [*rows]} | ({"not_read": [*not_read]} if not_read else {}))
     return is_empty
 
 

@@ -164,6 +164,7 @@ def test_recordings_says_whose_they_are_and_names_what_is_not_read(
 ) -> None:
     own_all(folder)
     write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
+    assert "not_read" not in exits(0, "recordings .").out
     (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
     os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
     found = rows(exits)
