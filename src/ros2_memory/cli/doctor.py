@@ -22,14 +22,29 @@ from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reaso
 from ros2_memory.cli.output import escape, format_size, print_json, print_line, spinner
 from ros2_memory.columns.store import relative
 from ros2_memory.config import NullRecorderNode, Settings, files_in_use, unused_config
-from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
+from ros2_memory.core.errors import (
+    BagError,
+    ConfigError,
+    EpisodicError,
+    InvalidArgumentsError,
+    LakeError,
+    NoDataError,
+    UndecodableError,
+)
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
+from ros2_memory.history.driven_path import (
+    frame_of_newest_pose,
+    resolve_path_topic,
+    root_above,
+)
 from ros2_memory.history.no_data import nothing_here
 from ros2_memory.history.robots import ADVICE, describe_mixed
+from ros2_memory.history.transforms import connects
+from ros2_memory.history.view import open_view
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
@@ -110,7 +125,7 @@ error: Final = partial(Finding, Level.ERROR, "")
 
 
 def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
-    """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
+    """Check configuration, disk, clock, bags, poses, recorder, ROS environment, topics and server.
 
     Each finding says how to fix it.
     """
@@ -279,6 +294,31 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
             "at one of them: --recording NAME, data.recording=NAME"
         )
         yield warning(sentence.removesuffix(ADVICE), do)
+
+
+def check_poses(robot: Examined) -> Iterator[Finding]:
+    """Checks that a topic places the robot, and that its map is the one that is configured."""
+    if not robot.snapshot.bags:
+        return
+    view = open_view(robot.memory, Call(), robot.now)
+    if not view.has_poses:
+        return
+    try:
+        frame = frame_of_newest_pose(view, resolve_path_topic(view))
+    except (InvalidArgumentsError, NoDataError) as unknown:
+        yield warning("where the robot was is not known", str(unknown))
+        return
+    except UndecodableError:
+        return  # the check of the bags names the topic
+    map_frame, root = view.limits.map_frame, root_above(view, frame)
+    if (
+        map_frame
+        and root
+        and map_frame not in {root, frame}
+        and not connects(view, (map_frame, frame))
+    ):
+        seen = f"no transforms lead from {frame} to data.map_frame, which is {map_frame}"
+        yield warning(seen, f"they lead to {root}: if that is a map, set data.map_frame={root}")
 
 
 class _Fault(NamedTuple):
@@ -570,6 +610,7 @@ _OF_BAGS: Final = {
     "disk": check_disk,
     "clock": check_clock,
     "bags": check_bags,
+    "poses": check_poses,
     "columns": check_columns,
 }
 _OF_RECORDER: Final = {

@@ -445,6 +445,12 @@ def body_at(view: View, at: Ns) -> Body | None:
     return robot_body(view, session) or robot_body(view)
 
 
+def root_above(view: View, frame: str) -> str | None:
+    """Returns the frame that all frames above a frame lead to; None if there is none above it."""
+    above = _ancestors(frame, {edge.child: edge.parent for edge in view.sessions.edges})
+    return above[-1] if above else None
+
+
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
     """Returns the frames above a frame, the nearest first; stops at a loop."""
     frames: list[str] = []

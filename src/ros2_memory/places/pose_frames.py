@@ -42,6 +42,7 @@ from ros2_memory.history.driven_path import (
     newest_of_body,
     resolve_path_topic,
     robot_body,
+    root_above,
 )
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
@@ -384,9 +385,11 @@ def changing_origin(frame_id: str) -> str:
 def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None:
     """Notes if positions outside of the map are of several runs of odometry."""
     if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
+        root = root_above(view, frame_id)
+        advice = f"; transforms lead from it to {root}: if that is a map, set data.map_frame={root}"
         view.notes.add(
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
-            "coordinates may be another place in each"
+            f"coordinates may be another place in each{advice if root else ''}"
         )
 
 

@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
-from tests.support.bags import McapLayout, Msg, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, tf, transform, write_mcap
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.program import Program
 from tests.unit.cli.conftest import left
@@ -323,6 +323,27 @@ def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_n
     # The other one has just been closed, and no thinned day is ever shipped.
     write_mcap(robot / "memory" / "20261120.thinned.mcap", [odom(old, 0.0, 0.0)])
     assert examined(0, required) == {}
+
+
+def test_poses_that_are_to_be_chosen_and_a_map_of_another_name_are_told(
+    robot: Path, examined: Examined
+) -> None:
+    [bag] = robot.glob("rec/*.mcap")
+    now = time.time_ns()
+    placed = [odom(now - n * NS_PER_S, n / 10, 0.0, topic="/odometry") for n in range(20, 40)]
+    site = [
+        tf(message.log_time, transform(message.log_time, "site", "odom", (1.0, 0.0, 0.0)))
+        for message in placed
+    ]
+    others = [replace(message, topic="/fused") for message in placed]
+    write_mcap(bag, sorted([*placed, *others, *site], key=lambda message: message.log_time))
+    beat(robot, subscribed=("/odometry",))
+    [unknown] = examined(1)["poses"]
+    assert unknown["do"].startswith("data.pose_topic is /odom, which these bags do not have; ")
+    [elsewhere] = examined(1, "data.pose_topic=/odometry")["poses"]
+    assert elsewhere["seen"] == "no transforms lead from odom to data.map_frame, which is map"
+    assert elsewhere["do"] == "they lead to site: if that is a map, set data.map_frame=site"
+    assert "poses" not in examined(1, "data.pose_topic=/odometry data.map_frame=site")
 
 
 def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(

@@ -404,3 +404,22 @@ def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
     asked_for = "the origin of world may change with every start, unless data.map_frame names it"
     assert (asked_for in notes) == (map_frame == "map")
     assert "changes with every start" not in notes
+
+
+def test_of_several_runs_the_note_names_the_frame_that_may_be_the_map(tmp_path: Path) -> None:
+    for nth in range(2):
+        begin = (1_784_000_000 + nth * 1000) * 10**9
+        moved = [
+            tf(
+                at := begin + n * 10**8,
+                transform(at, "site", "vision", (0.0, 0.0, 0.0)),
+                transform(at, "vision", "base_link", (n / 50, 0.0, 0.0)),
+            )
+            for n in range(100)
+        ]
+        poses = [odom(message.log_time, n / 50) for n, message in enumerate(moved)]
+        for pose in poses:
+            pose.body.header.frame_id = "vision"  # type: ignore[attr-defined]
+        write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", [*moved, *poses])
+    notes = asked(memory_of(tmp_path), "visits", x=1.0, y=0.0, radius_m=0.2)["notes"]
+    assert "lead from it to site: if that is a map, set data.map_frame=site" in str(notes)
