@@ -10,7 +10,7 @@ from ros2_memory.storage.base import Definition
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.core.model import JsonObject, JsonValue
+    from ros2_memory.core.model import JsonValue
 
 _MOST_FIELDS: Final = 1000
 """Nested types of a few lines can have more fields than fit into memory."""
@@ -49,7 +49,7 @@ def _example(kind: str | Definition, budget: Iterator[int]) -> JsonValue:
         return 0
     if shown is ValueKind.QUATERNION:
         return dict.fromkeys(ANGLES, 0)
-    example: JsonObject = {}
+    example: dict[str, JsonValue] = {}
     for (name, inner, length), _ in zip(kind.fields, budget, strict=False):
         element = _example(inner, budget)
         example[name] = element if length is None else [element]

@@ -154,7 +154,8 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif is_empty:
         _print_nothing(memory)
     else:
-        print_reply({"recordings": [*rows]} | ({"not_read": [*not_read]} if not_read else {}))
+        lists = {"recordings": rows, "not_read": not_read}
+        print_reply({name: [*listed] for name, listed in lists.items() if listed})
     return is_empty
 
 
