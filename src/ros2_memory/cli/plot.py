@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 FORMATS: Final = (".svg", ".png")
 _EVERYWHERE: Final = Box(-math.inf, -math.inf, math.inf, math.inf, 0.001)
 """The path is drawn to the millimetre."""
+_SHORTEST_S: Final = 0.001
+"""A recap needs some length."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
 _PERIODS: Final = 5
@@ -77,12 +79,14 @@ class PlotWindow(NamedTuple):
 
     @property
     def span(self) -> Seconds:
-        """The first and the last time of the window (Unix s, inclusive)."""
-        return _in_seconds((self.window.start, self.window.stop - 1))
+        """The first and the last time that were asked for (Unix s, inclusive)."""
+        return _in_seconds(self.window.asked())
 
     def recap(self) -> Recap:
         """Returns the recap of the window."""
-        return recap(self.view.memory, Call(), TimeRange.over(self.window))
+        start_s, end_s = self.span
+        asked = TimeRange(start_s, max(end_s, start_s + _SHORTEST_S))
+        return recap(self.view.memory, Call(), asked)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -118,6 +118,15 @@ def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
     assert len(topics["/odom"]) == 2
 
 
+def test_a_picture_is_of_the_time_that_was_asked_for(bags: Path) -> None:
+    """Not of one that begins 2 us before it, at 23:59:59 of the day before."""
+    start, end = 1_700_000_010.0, 1_700_000_020.0
+    asked = whole_memory(bags)._replace(window=TimeWindow.from_unix(start, end))
+    assert asked.span == (start, end)
+    recap = asked.recap()
+    assert (recap.start, recap.end) == (T0 + 10 * S, T0 + 20 * S)
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
