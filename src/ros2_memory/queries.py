@@ -393,7 +393,12 @@ def _unplaced_error(view: View, at: Ns, tolerance: Ns | None, frame_id: str | No
         error = error or no_data_at(view, view.moving_topics, at, tolerance)
     except NoDataError as no_transform:
         error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), no_transform)
-    fixes = topics_with(view, "geodetic")
+    near = TimeWindow.around(at, TF_CACHE_NS)
+    fixes = [
+        named
+        for named in topics_with(view, "geodetic")
+        if view.stream.newest(named.partition(" ")[0], near) is not None
+    ]
     advice = f"; latitude and longitude are on {listed(fixes)}: give topic" if fixes else ""
     return NoDataError(error.reason, error.detail + advice, error.notes)
 

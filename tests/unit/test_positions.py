@@ -249,6 +249,9 @@ def test_in_a_gap_of_transforms_no_position_is_known(tmp_path: Path, recalls: bo
         assert "latitude and longitude are on /fix" in reply["detail"]
     reply = asked(memory, "get_position_at", timestamp=T0_S + 25, topic="/fix")
     assert (reply["x"], reply["latitude"]) == (None, 48.1237067)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 250)
+    assert reply["reason"] == "outside_range"
+    assert "/fix" not in reply["detail"]
 
 
 def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_path: Path) -> None:
