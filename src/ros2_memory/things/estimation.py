@@ -78,7 +78,7 @@ def estimate(
     Detections with a score below `min_score`, to 0.05, do not count. `go_on` is called again and
     again; its errors end the estimate.
     """
-    observed = Observations(sights, min_score, go_on)
+    observed = Observations(sights, labels, min_score, go_on)
     names = _names_to_show(sights, labels)
     keys = with_synonyms(sights, observed.counts, labels, go_on)
     groups = groups_in(observed, keys)
@@ -105,6 +105,7 @@ def estimate(
         instances=instances,
         movers=movers,
         counts=observed.counts,
+        carried=observed.carried,
         poor=observed.poor,
         names=names,
         evidence=_evidence_of(instances, groups),

@@ -178,6 +178,8 @@ class Estimate:
     movers: list[Mover]
     counts: Ints
     """How many detections of each spot count."""
+    carried: Flags
+    """Which spots are of what the robot carried: none of their detections counts."""
     poor: Flags
     """Which spots were seen while localisation was poor."""
     names: dict[str, str]
@@ -200,6 +202,7 @@ class Estimate:
     def memory_bytes(self) -> int:
         """About how much memory the estimate takes."""
         tables: list[Columns | Ints | Flags] = [self.spots, self.unplaced, self.counts, self.poor]
+        tables.append(self.carried)
         tables += chain((self.stay_of,), self.scores, self.hits, self.looks)
         tables += chain(self.unplaced_of.values(), *self.evidence.values())
         tables += chain((stay.spots for _, stay in self.stays))

@@ -34,7 +34,9 @@ from ros2_memory.core.arrays import (
     stable_order,
 )
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.things.carried import carried_spots
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
+from ros2_memory.things.labels import moves_by_itself
 from ros2_memory.things.places import Sightings, poorly_localised
 from ros2_memory.things.presence import Cells, Evidence, Stay, half_turns
 
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
+    from ros2_memory.things.labels import Labels
 
 FEWEST: Final = 3
 """Fewer detections are no thing: a detector sees what is not there."""
@@ -87,7 +90,8 @@ class Observations:
     """The sights of an estimate, and what is computed once for all labels.
 
     Attributes:
-        counts: how many detections of each spot count.
+        counts: how many detections of each spot count; none of what the robot carried.
+        carried: which spots are of what the robot carried.
         poor: which spots were seen while localisation was poor: they move nothing.
         hits: the looks of detections that count, by spot; -1 where localisation was poor.
         groups: a number for each spot, equal for spots of one slice, topic and label.
@@ -97,12 +101,19 @@ class Observations:
         go_on: as in `estimate`.
     """
 
-    def __init__(self, sights: JoinedSights, min_score: float, go_on: Callable[[], None]) -> None:
+    def __init__(
+        self, sights: JoinedSights, labels: Labels, min_score: float, go_on: Callable[[], None]
+    ) -> None:
         spots, self.sights, self.go_on = sights.spots, sights, go_on
         self.counts = spots[:, Spot.N]
         low = np.flatnonzero(sights.scores[:, Score.BIN] < lowest_bin(min_score))
         spot, n = (sights.scores[low, name] for name in (Score.SPOT, Score.N))
         self.counts -= np.bincount(spot, n, len(spots)).astype(np.int64)
+        # People who walk along are carried by nobody.
+        keys = map(labels.key, sights.labels)
+        goes = np.array([moves_by_itself(key) for key in keys], np.bool_)[spots[:, Spot.LABEL]]
+        self.carried = carried_spots(sights) & ~goes
+        self.counts[self.carried] = 0
         self.poor, poor_looks = poorly_localised(sights)
         # Which hits are of detections that count is not known: as many in proportion, rounded up.
         spot, look, n = (sights.hits[:, name] for name in Hit)

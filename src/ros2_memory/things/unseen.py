@@ -105,6 +105,8 @@ class _LabelDetections(NamedTuple):
     Attributes:
         counted: detections that count.
         low: detections with too low a score.
+        carried: detections of what the robot carried.
+        last_carried: their last log time (ns), if none that counts is later; else `MIN_NS`.
         unplaced: detections without a place.
         first_unplaced, last_unplaced: their first and last log time (ns).
         last_placed: the last log time (ns) of a detection with a place.
@@ -114,6 +116,8 @@ class _LabelDetections(NamedTuple):
     name: str
     counted: int
     low: int
+    carried: int
+    last_carried: Ns
     unplaced: int
     first_unplaced: Ns
     last_unplaced: Ns
@@ -123,7 +127,7 @@ class _LabelDetections(NamedTuple):
     @property
     def total(self) -> int:
         """How often it was detected."""
-        return self.counted + self.low + self.unplaced
+        return self.counted + self.low + self.carried + self.unplaced
 
 
 def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
@@ -400,10 +404,15 @@ def _detections_of(
         number = number_of[key]
         rows, lost = during[rows_of[number]], unplaced[unplaced_rows_of[number]]
         spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
+        carried, counting = estimate.carried[rows], estimate.counts[rows] > 0
+        last_carried = int(spots[carried, Spot.LAST].max(initial=MIN_NS))
+        is_newest = last_carried > int(spots[counting, Spot.LAST].max(initial=MIN_NS))
         detections[key] = _LabelDetections(
             name=estimate.names[key],
             counted=count,
-            low=int(spots[:, Spot.N].sum()) - count,
+            low=int(spots[~carried, Spot.N].sum()) - count,
+            carried=int(spots[carried, Spot.N].sum()),
+            last_carried=last_carried if is_newest else MIN_NS,
             unplaced=int(lost[:, Unplaced.N].sum()),
             first_unplaced=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
             last_unplaced=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
@@ -445,6 +454,12 @@ def _detection_notes(
     if unplaced:
         lost = counted(unplaced, "detection")
         yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
+    if in_window.last_carried > MIN_NS:
+        times = counted(in_window.carried, "time")
+        yield (
+            f"it was seen {times}, last at {unix_text(in_window.last_carried)}, to go along with "
+            "the robot, as what it carries: that is no place of it"
+        )
     if key in question.found:
         return
     if in_window.low:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import count
+from itertools import chain, count
 from operator import attrgetter
 from pathlib import Path
 from random import Random
@@ -673,6 +673,70 @@ def test_a_detector_that_repeats_one_message_looks_at_nothing(
         "crate": {"not_looked_at_since": BEGIN + 59},
     }
     assert not any("moved_times" in each or "moves" in each for each in things)
+
+
+def drive(begin: int, x: float, seen_from: Callable[[float], Sequence[Seen]]) -> list[Msg]:
+    """20 s along x, 0.5 m/s, with what is seen from each x."""
+    xs = [(at, x + at / 2) for at in range(21)]
+    return [m for at, x in xs for m in scene(begin + at, (x, 0.0, 0.0), seen_from(x))]
+
+
+def test_where_the_robot_passed_with_what_it_carries_is_no_place_of_it(tmp_path: Path) -> None:
+    """It picks a cup up at x = 2, holds it 0.6 m ahead, and puts it down at x = 12.1."""
+    before, after = ("cup", 2.0, 0.1), ("cup", 12.1, 0.1)
+    carries = drive(30, 1.0, lambda x: [("cup", x + 0.6, 0.05)])
+    messages = [*looked(0, 30, HERE, before), *carries, *looked(51, 80, (11.0, 0.0, 0.0), after)]
+    write_splits(tmp_path, messages)
+    plain = memory_of(tmp_path, limits=NAMED)
+    for memory in (plain, with_store(plain, tmp_path)):
+        find = partial(asked, memory, "find_things", label="cup")
+        [cup] = find()["things"]
+        assert (cup["place"]["x"], cup["place"]["y"]) == pytest.approx((12.1, 0.1), abs=0.02)
+        assert [stay["place"]["x"] for stay in cup["moved"]] == pytest.approx([2.0, 12.1], abs=0.02)
+        carrying = find(end=BEGIN + 45)
+        [held] = carrying["things"]
+        assert (held["place"]["x"], held["last_seen"]) == (2.0, BEGIN + 29)
+        goes_along = f"last at {BEGIN + 45}.000000, to go along with the robot"
+        assert goes_along in str(carrying["notes"])
+        assert "go along" not in str(find().get("notes"))
+        window = {
+            "start": BEGIN + 51,
+            "end": BEGIN + 80,
+            "with_start": BEGIN,
+            "with_end": BEGIN + 29,
+        }
+        changed = asked(memory, "compare", **window)["things"]
+        [moved] = changed.pop("moved")
+        assert (moved["was"]["x"], moved["is"]["x"]) == pytest.approx((2.0, 12.1), abs=0.05)
+        assert changed == {}
+
+
+def test_what_was_only_seen_while_the_robot_carried_it_has_no_place(tmp_path: Path) -> None:
+    write_splits(tmp_path, drive(0, 0.0, lambda x: [("cup", x + 0.6, 0.05)]))
+    found = ask(tmp_path, label="cup")
+    assert (found["things"], found["total"]) == ([], 0)
+    note = (
+        f"it was seen 21 times, last at {BEGIN + 20}.000000, to go along with the robot, "
+        "as what it carries: that is no place of it"
+    )
+    assert found["notes"] == [note]
+
+
+def test_what_stands_in_a_row_beside_the_way_is_not_carried(tmp_path: Path) -> None:
+    """A camera that looks to the side sees each of them abreast, for 1.2 m of the way."""
+    boxes = [("box", 1.0 + 2 * nth, 0.9) for nth in range(5)]
+    passes = [
+        drive(30 * nth, 0.5, lambda x: [box for box in boxes if abs(box[1] - x) < 0.6])
+        for nth in range(3)
+    ]
+    found = told_of(tmp_path, [*chain.from_iterable(passes)], label="box")
+    assert sorted(box["place"]["x"] for box in found["things"]) == [1, 3, 5, 7, 9]
+
+
+def test_people_who_go_along_are_not_carried(tmp_path: Path) -> None:
+    along = told_of(tmp_path, drive(0, 0.0, lambda x: [("person", x + 1.0, 0.2)]), label="person")
+    [person] = along["things"]
+    assert (person["moves"], person["count"]) == (True, 21)
 
 
 @pytest.mark.parametrize("far", [1e12, 1.7e308])
