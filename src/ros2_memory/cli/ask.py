@@ -25,7 +25,7 @@ from ros2_memory.cli.options import (
     present_time,
     with_date,
 )
-from ros2_memory.cli.output import print_json, print_line, print_reply, spinner
+from ros2_memory.cli.output import plain_cell, print_json, print_line, print_reply, spinner
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -43,6 +43,8 @@ _SETTING: Final = re.compile(
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""
+_QUERY_LAKE: Final = "query_lake"
+"""Not imported: without a fleet nothing of `fleet` is."""
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
 
@@ -119,8 +121,19 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(answer)
+        print_reply(_with_plain_cells(answer) if name == _QUERY_LAKE else answer)
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
+
+
+def _with_plain_cells(answer: JsonValue) -> JsonValue:
+    """Returns a reply to a SELECT whose rows have no float that looks like a time."""
+    rows = answer.get("rows") if isinstance(answer, dict) else None
+    if not isinstance(answer, dict) or not isinstance(rows, list):
+        return answer
+    plain: list[JsonValue] = [
+        [*map(plain_cell, row)] if isinstance(row, list) else row for row in rows
+    ]
+    return answer | {"rows": plain}
 
 
 def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:

@@ -176,6 +176,11 @@ def leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
         yield path, value
 
 
+def plain_cell(cell: JsonValue) -> JsonValue:
+    """Returns a cell of a SELECT as it is printed: a float as text, since one may seem a time."""
+    return f"{cell:.15g}" if isinstance(cell, float) else cell
+
+
 def format_value(value: JsonValue) -> str:
     """Formats a value in one line: a time as local time; null and what is empty as `-`."""
     if value is None:

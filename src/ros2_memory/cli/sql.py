@@ -7,7 +7,7 @@ import typer
 from ros2_memory.bootstrap_fleet import open_lake
 from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import AsJson, Overrides, load_for
-from ros2_memory.cli.output import print_exactly, print_line, print_reply
+from ros2_memory.cli.output import plain_cell, print_exactly, print_line, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.tools.reply_size import to_json_text
@@ -43,14 +43,9 @@ def sql(
         return
     if len(set(table.columns)) < len(table.columns):
         raise InvalidArgumentsError("two columns have one name: give one another with AS, or --csv")
-    rows = table.rows if as_json else [[*map(_shown, row)] for row in table.rows]
+    rows = table.rows if as_json else [[*map(plain_cell, row)] for row in table.rows]
     answer: list[JsonValue] = [dict(zip(table.columns, row, strict=True)) for row in rows]
     if as_json:
         print_line(to_json_text(answer))
     else:
         print_reply(answer)
-
-
-def _shown(cell: JsonValue) -> JsonValue:
-    """Returns a cell as it is printed: a float as text, since a reply's may be a time."""
-    return f"{cell:.15g}" if isinstance(cell, float) else cell

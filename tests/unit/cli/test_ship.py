@@ -192,7 +192,7 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
 
 @pytest.mark.usefixtures("selecting_here")
 def test_a_select_is_answered_over_the_tables_as_they_are_now(
-    ship: Ship, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+    fleet: Path, ship: Ship, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ship(0)
     counted, of_lake = (
@@ -210,6 +210,9 @@ def test_a_select_is_answered_over_the_tables_as_they_are_now(
     assert row == {"a": 0.5, "b": None, "c": {"x": 1}, "d": "01", "e": "2026-11-20"}
     printed = exits(0, "sql", "SELECT 1500000000.25::DOUBLE AS mean_ns, NULL AS b", *of_lake).out
     assert printed.split() == ["mean_ns", "b", "1500000000.25", "-"]  # it is no time
+    asking = ["select=SELECT 1500000000.25::DOUBLE AS mean_ns", f"fleet.robots={fleet}/*"]
+    answered = exits(0, "ask query_lake lake=duckdb", *asking, *of_lake).out
+    assert answered.split()[-2:] == ["mean_ns", "1500000000.25"]
     assert "two columns have one name" in exits(2, "sql 'SELECT 1 AS a, 2 AS a'", *of_lake).err
     assert exits(0, "sql --csv 'SELECT 1 AS a, 2 AS a'", *of_lake).out == "a,a\n1,2\n"
     nested = "SELECT true AS a, [1, NULL] AS b, MAP{'x': 1} AS c, NULL AS d"
