@@ -119,6 +119,14 @@ def all_bytes(folder: Path) -> bytes:
     return b"".join(path.read_bytes() for path in folder.rglob("*") if path.is_file())
 
 
+def test_a_folder_that_is_no_option_is_refused_with_the_option(
+    bag_dir: Path, forget: Forget
+) -> None:
+    refused = forget(2, 0, 100, f"{bag_dir} --yes").err
+    assert f"{bag_dir} is no setting: name the bag directory as --bag-dir {bag_dir}" in refused
+    assert bags(bag_dir) == [f"rec_{number}.mcap" for number in range(4)]
+
+
 def test_bags_that_others_record_and_no_window_are_refused(
     bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
