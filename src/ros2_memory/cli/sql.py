@@ -9,11 +9,11 @@ from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import AsJson, Overrides, load_for
 from ros2_memory.cli.output import plain_cell, print_exactly, print_line, print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import JsonValue
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from ros2_memory.config import DuckdbNode
+    from ros2_memory.core.model import JsonValue
 
 
 def sql(
