@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 BAG_DIR_ITSELF: Final = "."
 """Names the recording whose bags lie in the bag directory itself, if their names do not."""
+_LONE_NUMBER: Final = re.compile(r"_(?:0|[1-9]\d{0,4})$")
 _BESIDE_OTHERS: Final[Key[dict[tuple[str, ...], dict[str, str]]]] = Key()
 """Of a timeline: `loose_bags_beside_others`, by the folders with a metadata.yaml."""
 
@@ -147,7 +148,13 @@ def _series_of(file: str) -> str:
 def _are_splits(bags: Sequence[BagFile]) -> bool:
     """Returns whether bags are numbered, and each ends before the next begins."""
     ordered = sorted(bags, key=lambda bag: (bag.start, bag.end))
-    is_numbered = len(bags) == 1 or all(_series_of(bag.file) != stem_of(bag.file) for bag in bags)
+    stems = [stem_of(bag.file) for bag in bags]
+    # The number at the end of a lone name may be a date: `ros2 bag record` counts without zeros.
+    is_numbered = (
+        all(_series_of(bag.file) != stem for bag, stem in zip(bags, stems, strict=True))
+        if stems[1:]
+        else _LONE_NUMBER.search(stems[0]) is not None
+    )
     return is_numbered and all(
         bag.end <= next_bag.start + OUT_OF_ORDER_NS for bag, next_bag in pairwise(ordered)
     )

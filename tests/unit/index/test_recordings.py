@@ -97,6 +97,22 @@ def test_a_bag_directory_that_is_a_recording_has_a_name_that_selects_it(
     assert settings.data.recording == name
 
 
+@pytest.mark.parametrize(
+    ("bag", "name"),
+    [("walk_00", "walk_00"), ("walk_20261130", "walk_20261130"), ("walk_0", "walk"), ("w", "w")],
+)
+def test_a_lone_bag_among_others_keeps_a_number_that_is_none_of_a_split(
+    tmp_path: Path, bag: str, name: str
+) -> None:
+    for n, file in enumerate([bag, "run_0", "run_1"]):
+        write(tmp_path, file, at_s=n)
+    index = index_of(tmp_path)
+    recordings = recordings_of(index.refresh())
+    names = {name_of(path, own, str(tmp_path)): own for path, own in recordings.items()}
+    assert {*names} == {name, "run"}
+    assert [*index.alone(name).refresh().bags] == names[name]
+
+
 def test_the_index_of_one_recording_has_no_other_than_that_which_it_is_made_of(
     tmp_path: Path,
 ) -> None:
