@@ -22,7 +22,10 @@ Adapters translate every foreign exception into this tree; only `tools.replies` 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 
 class EpisodicError(Exception):
@@ -135,6 +138,14 @@ class UndecodableError(EpisodicError):
         self.topic = topic
         self.type_name = type_name
         self.reason = reason
+
+
+def to_report(failures: Iterable[UndecodableError]) -> UndecodableError:
+    """Returns the error that a reply reports of several: the same in whatever order files are read.
+
+    There is at least one.
+    """
+    return min(failures, key=str)
 
 
 class RefusedError(EpisodicError):

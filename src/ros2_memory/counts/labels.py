@@ -27,10 +27,10 @@ from ros2_memory.analysis.intervals import (
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
-from ros2_memory.core.text import listed, named
+from ros2_memory.core.text import Reason, listed, named
 from ros2_memory.counts.bins import HELD_COLUMNS
 from ros2_memory.history.clock_steps import elapsed_in
-from ros2_memory.history.context import READING_S
+from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import note_edges, note_unread, seconds, shown_span, unix_text
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.no_data import matching_topics
@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 BY_LABEL: Final = "label"
 _MOST_LABELS: Final = 60
 _TEXT: Final = "std_msgs/msg/String"
+_UNDECODED: Final = Reason("that could not be decoded", "topic", of="messages of ")
 _COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
     *HELD_COLUMNS,
     ("best_score", "number"),
@@ -283,7 +284,7 @@ def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Topic
         if detected.log_times.size:
             yield _TopicBlock(topic, detected)
     if left_out:
-        view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
+        view.notes.add_lack(Note(_UNDECODED, topic, str(left_out)))
 
 
 def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock:

@@ -21,7 +21,12 @@ from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.arrays import range_numbers
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    QueryTimeoutError,
+    UndecodableError,
+    to_report,
+)
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import rounded_beside
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -574,7 +579,7 @@ def _cells_of_fields(
     collected.collect(binned.counted)
     binned.count_since(collected.since)
     if collected.failures:
-        reason = collected.failures[0].reason
+        reason = to_report(collected.failures).reason
         view.notes.add_lack(f"messages left out, since they cannot be decoded: {reason}")
     pieces_of_bins = [np.flatnonzero(member).tolist() for member in binned.bins.member.T]
     all_pieces = range(len(binned.bins.member))

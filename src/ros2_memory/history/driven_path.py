@@ -32,6 +32,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     NoDataReason,
     UndecodableError,
+    to_report,
 )
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
@@ -114,9 +115,10 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice
     driven = ((at, part) for at, part in slices if part.poses or part.invalid)
     newest_first, since = read_until_late(view, driven, READING_S)
     if failures and not newest_first:
-        raise with_notes(view, window, undecodable(failures[0])) from failures[0]
+        failure = to_report(failures)
+        raise with_notes(view, window, undecodable(failure)) from failure
     if failures:
-        why = f"{len(failures)} ({failures[0].reason})"
+        why = f"{len(failures)} ({to_report(failures).reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
     return joined_slices(newest_first[::-1], fastest) if newest_first else None, since

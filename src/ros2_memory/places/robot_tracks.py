@@ -37,7 +37,7 @@ from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.arrays import Flags, Ints, stable_order
-from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
+from ros2_memory.core.errors import QueryTimeoutError, UndecodableError, to_report
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
@@ -129,7 +129,7 @@ class TrackReader:
                 "ask about a shorter window"
             ) from error
         if self._failures:
-            note_left_out(view, self._failures[0])
+            note_left_out(view, to_report(self._failures))
         left_out = sum(track.left_out for track in tracks)
         track, others = self._tracks_of_robots(tracks, around)
         known[key] = KnownTrack(track, since, left_out, others)

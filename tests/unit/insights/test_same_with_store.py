@@ -237,3 +237,31 @@ def test_every_question_is_answered_as_without_a_store(
                 # What was joined of all that is stored serves when it is asked for again.
                 for _ in range(2):
                     assert_same_counts(asked(known, tool, **given_), answer)
+
+
+def test_messages_that_cannot_be_decoded_are_reported_alike_in_whatever_order_bags_are_read(
+    tmp_path: Path,
+) -> None:
+    """In each of four bags some messages are cut off, each time at another byte."""
+    for bag in range(4):
+        messages = []
+        for second in range(20 * bag, 20 * bag + 20):
+            at, is_cut = BEGIN + second * S, second % 5 == 1
+            messages += [
+                cut_to(odom(at, second / 10), (40, 300, 60, 100)[bag] if is_cut else None),
+                cut_to(text(at + 1, "hello", "/say"), (6, 9, 7, 10)[bag] if is_cut else None),
+                cut_to(text(at + 1, "hello", "/shout"), (9, 6, 10, 7)[bag] if is_cut else None),
+            ]
+        write_mcap(tmp_path / "rec" / f"rec_{bag}.mcap", messages)
+    begin = BEGIN / S
+    windows = {"start": begin + 40, "end": begin + 79, "with_start": begin, "with_end": begin + 39}
+    said = {"topic": "/s*", "condition_type": "contains", "value": "hello", "by": "hour"}
+    plain, stored = (memory_of(tmp_path, recalls=recalls) for recalls in (False, True))
+    for tool, question in (("compare", windows), ("find_matches", said)):
+        notes = asked(plain, tool, **question)["notes"]
+        assert any("decoded" in note for note in notes)
+        assert asked(stored, tool, **question)["notes"] == notes
+
+
+def cut_to(message: Msg, size: int | None) -> Msg:
+    return message if size is None else replace(message, body=message.payload[:size])
