@@ -109,7 +109,7 @@ def note_unread(
     if must_be_complete:
         notes.add(*describe_thinned(view.snapshot, window))
     if os.path.lexists(bag_dir / OWN_FOLDER):
-        deleted = [_span_text(*span) for span in deleted_between(view, window)]
+        deleted = [span_text(*span) for span in deleted_between(view, window)]
         if deleted:
             named = listed(deleted[-MAX_NAMED:], len(deleted))
             notes.add(f"recorded, and deleted since: {named}")
@@ -186,7 +186,7 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             refused[loss.topic].append((loss.start, loss.stop - 1))
     topics = sorted(refused)
     for topic in topics[:MAX_NAMED]:
-        spans = [_span_text(*span) for span in united(refused[topic], _EDGE_NS)]
+        spans = [span_text(*span) for span in united(refused[topic], _EDGE_NS)]
         yield (
             f"messages of a publisher of {topic} were not recorded from "
             f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS or type did not fit the "
@@ -225,7 +225,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
                 continue
             if window.overlaps(start, end) and (cause or is_unexplained_noted):
                 what = "could be read" if is_unread and not cause else "was recorded"
-                texts[cause, what].append(_span_text(start, end))
+                texts[cause, what].append(span_text(start, end))
     for (cause, what), spans in texts.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
         because = f", because {INTERRUPTIONS[cause]}" if cause else ""
@@ -271,7 +271,8 @@ def _describe_open_end(
         yield f"after {unix_text(latest)} messages may be missing, because {', and '.join(causes)}"
 
 
-def _span_text(start: Ns, end: Ns) -> str:
+def span_text(start: Ns, end: Ns) -> str:
+    """Returns a span of log time, and how long it is, for a sentence."""
     return f"{unix_text(start)} to {unix_text(end)} ({seconds(end - start)})"
 
 

@@ -25,9 +25,9 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
 from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
-from ros2_memory.core.text import abbreviate, caseless
+from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
-from ros2_memory.history.coverage import unknown_times
+from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
 from ros2_memory.history.reverse_search import (
@@ -319,7 +319,7 @@ class Scope:
 
     def _limit_to_place(self, place: Where) -> None:
         view, window = self._view, self.window
-        known_track = known_track_for(view, place, window)
+        known_track = _track_for(view, place, window)
         self.since = known_track.since
         inside = known_track.inside(place.region, window)
         self._inside = united((stay.start, stay.stop + 1) for stay in inside)
@@ -383,14 +383,23 @@ class Scope:
 def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
     """Returns the robot's track in the frame of a region: its own, or else the map.
 
-    Notes say how far back the track is known, and whether the robot was in the region if that is
-    taken in the poses' frame.
+    Notes say how far back the track is known, when it is not, and whether the robot was in the
+    region if that is taken in the poses' frame.
 
     Raises:
         InvalidArgumentsError: poses are not in the region's frame, and cannot be placed there.
         NoDataError: no pose is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
+    known = _track_for(view, where, window)
+    unknown = unknown_times(view, window, placed_times(known.track, []), WHEREABOUTS, mixed=[])
+    if unknown and known.reaches(window):
+        named = [span_text(*span) for span in unknown[-MAX_NAMED:]]
+        view.notes.add(f"{WHEREABOUTS} is not known from {listed(named, len(unknown))}")
+    return known
+
+
+def _track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
     topic = resolve_path_topic(view)
     placement = map_placement(view, topic, where.frame_id)
     known = known_track(view, where.frame_id or placement.frame_id, window)

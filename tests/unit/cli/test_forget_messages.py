@@ -368,6 +368,24 @@ def test_the_time_in_a_place_goes_with_a_second_on_either_side(
     assert traces(home, f"{SAID} 70")
 
 
+def test_of_a_place_what_was_recorded_while_nobody_knew_where_the_robot_was_is_said_to_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    """The odometry is silent for 40 s, the camera is not."""
+    home, places = tmp_path / "home", tmp_path / "places.yaml"
+    body = [odom(T0 + n * S, n, 0.0) for n in range(60) if not 10 < n < 50]
+    body += [text(T0 + n * S + 7, f"{SAID} {n:02}", CAMERA) for n in range(60)]
+    left(write_mcap(home / "rec_h" / "rec_h_0.mcap", body))
+    own_all(home)
+    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    shown = forget(1, 0, 100, f"--yes --where bathroom data.places_file={places}").out
+    unknown = f"from {T0 // S + 10}.000001 to {T0 // S + 50}.000000 (40 s)"
+    assert f"what is not known: where the robot was is not known {unknown}" in shown
+
+
 def test_whatever_was_done_before_the_power_went_the_next_forget_finishes_it_and_says_so(
     tmp_path: Path,
     bag_dir: Path,

@@ -1,5 +1,6 @@
 """What happened in a time, what became of goals, what changed before and after a moment."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from random import Random
@@ -168,6 +169,22 @@ def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Pa
         "/landed in_air became true",
         "/armed became true",
     ]
+
+
+@pytest.mark.parametrize("tool", ["recap", "trajectory_summary"])
+def test_for_how_long_nobody_knows_whether_the_robot_was_in_a_place_is_said(
+    tmp_path: Path, tool: str
+) -> None:
+    """Poses have no numbers for 40 s."""
+    poses = [odom(BEGIN + t * S, math.nan if 10 < t < 50 else t) for t in range(90)]
+    memory, room = remembered(tmp_path, poses), {"x": [-1, 5], "y": [-1, 1]}
+    unknown = "where the robot was is not known"
+    note = f"{unknown} from {T0 + 10}.000001 to {T0 + 50}.000000 (40 s)"
+    assert "notes" not in asked(memory, "recap", start=T0, end=T0 + 9, where=room)
+    assert note in asked(memory, tool, start=T0, end=T0 + 89, where=room)["notes"]
+    there = asked(memory, "recap", start=T0 + 25, end=T0 + 35, where=room)
+    assert there["visits"] == 0
+    assert f"{unknown} at any time of the window" in there["notes"]
 
 
 def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: Path) -> None:
