@@ -267,7 +267,8 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
 def _without_gone(bag_dir: Path, rows: Iterable[Deleted]) -> list[Deleted]:
     """Returns one row for each recording that still exists, and one for all others.
 
-    Nothing lists the files of recordings that are gone any more.
+    Nothing lists the files of recordings that are gone any more. The files of the oldest that exist
+    are dropped, too, where the list would be too long.
     """
     present: list[Deleted] = []
     gone: list[Span] = []
@@ -276,15 +277,17 @@ def _without_gone(bag_dir: Path, rows: Iterable[Deleted]) -> list[Deleted]:
             present.append(row)
         else:
             gone += row.spans
-    left = [Deleted("", spans=tuple(united(gone, _TOUCHING_NS)[-_MOST_SPANS:]))]
+    left: list[Deleted] = []
     # The newest recordings come last, and stay longest.
     size = 0
     for row in reversed(present):
         size += len(DELETED.text([row]))
-        if size > _MOST_DELETED_BYTES // 2:
-            break
-        left.append(row)
-    return left
+        if size <= _MOST_DELETED_BYTES // 2:
+            left.append(row)
+        else:
+            gone += row.spans
+    rest = Deleted("", spans=tuple(united(gone, _TOUCHING_NS)[-_MOST_SPANS:]))
+    return [rest, *reversed(left)]
 
 
 def _by_recording(rows: Iterable[Deleted]) -> Mapping[str, Deleted]:

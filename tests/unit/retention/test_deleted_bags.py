@@ -180,6 +180,26 @@ def test_the_list_stays_short_however_long_the_robot_runs(
     assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [-50, 0, 1900]
 
 
+def test_times_of_files_that_the_list_has_no_room_for_are_known_as_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a recording of a day, of which every split is deleted but the last."""
+    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 4_000)
+    recording(tmp_path, A, 2_000)
+    recording(tmp_path, B, 3_000)
+    own_all(tmp_path)
+    for at in range(0, 2_000, 10):
+        split = f"{A}_{at // 10}.mcap", T0 + at * S, T0 + (at + 9) * S
+        append_deleted(tmp_path, [deleted_of(A, [split])])
+    for number in range(2):
+        append_deleted(tmp_path, [deleted_of(B, [(f"{B}_{number}.mcap", T0, T0 + S)])])
+    reply = ask(tmp_path, "get_topic_at_time", topic="/odom", timestamp=T0_S + 900)
+    told = f"recorded, and deleted since: {T0_S}.000000 to {T0_S + 1999}.000001 (1999 s)"
+    assert reply["notes"] == [told]
+    assert (tmp_path / DELETED_FILE).stat().st_size < 4_500
+    assert read_deleted(tmp_path)[B].files == (f"{B}_0.mcap", f"{B}_1.mcap")
+
+
 def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
