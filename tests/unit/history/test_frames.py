@@ -16,6 +16,7 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
 from ros2_memory.history import sessions
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
@@ -105,7 +106,7 @@ def test_a_call_that_needs_many_recordings_looks_up_all_at_once_whatever_an_earl
         mounted = fixed(begin, "base_link", "laser", 0.1 + nth)
         record(tmp_path / f"rec{nth:02}", [mounted, *drive(begin, 5)])
     memory = memory_of(tmp_path, recalls=True)
-    looked_up = Mock(wraps=sessions.scan)
+    looked_up = Mock(wraps=scan)
     monkeypatch.setattr(sessions, "scan", looked_up)
     for wanted in (range(4), range(4, 9)):
         looked_up.reset_mock()
