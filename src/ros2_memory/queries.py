@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
+from ros2_memory.analysis.conditions import NearPosition
 from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
@@ -39,6 +40,8 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
+from ros2_memory.history.condition_hints import compared_frames, position_frames
+from ros2_memory.history.conditions import condition_of, note_no_fix, types_matching
 from ros2_memory.history.coverage import (
     by_remark,
     describe_gaps,
@@ -76,21 +79,14 @@ from ros2_memory.history.no_data import (
     topics_with,
     with_notes,
 )
-from ros2_memory.history.reverse_search import (
-    ReverseSearch,
-    compared_frames,
-    condition_of,
-    may_be_elsewhere,
-    note_no_fix,
-    out_of_time,
-    types_matching,
-)
+from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import (
     note_robots,
     note_robots_near,
     require_one_robot,
 )
 from ros2_memory.history.scan import pick
+from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -127,6 +123,7 @@ from ros2_memory.things.unseen import notes_on_never
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
@@ -886,9 +883,24 @@ def _notes_on_never(view: View, search: _Search, reverse_search: ReverseSearch) 
         *describe_silences(view, topics, window),
         *notes_on_never(view, search.topic, condition, window, search.min_score),
     )
-    if notes or may_be_elsewhere(view, topics, condition):
+    if notes or _may_be_elsewhere(view, topics, condition):
         return (*notes, *compared_frames(view, topics, condition))
     return ()
+
+
+def _may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
+    """Returns whether `near_position` compared in other frames than other tools use.
+
+    Other tools use the map if transforms lead there.
+    """
+    target = view.limits.map_frame
+    if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
+        return False
+    others = {frame for _, frames in position_frames(view, topics) for frame in frames} - {target}
+    try:
+        return any(connects(view, (target, frame)) for frame in sorted(others))
+    except QueryTimeoutError:
+        return True
 
 
 def _search_end(before_s: float | None) -> Ns:

@@ -40,7 +40,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import held_times, states_hold_on
+from ros2_memory.history.held_values import TEXT, held_times, holds_on, is_latched
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.places.pose_frames import known_track, map_placement, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
+_BOOLEAN: Final = "std_msgs/msg/Bool"
 ClockBin: TypeAlias = Literal["day", "hour", "weekday"]
 By: TypeAlias = Literal["day", "hour", "weekday", "place"]
 Values: TypeAlias = "Sequence[float | None]"
@@ -359,7 +360,7 @@ class BinnedWindow:
         # What was counted is answered also where no time is left for this.
         with suppress(QueryTimeoutError):
             for topic in topics:
-                if states_hold_on(self.view, topic):
+                if _states_hold_on(self.view, topic):
                     held = held_times(self.view, [topic], self.counted)
                     known = (TimeWindow(*span).intersect(self.counted) for span in held)
                     heard += [(part.start, part.stop) for part in known if not part.empty]
@@ -554,3 +555,12 @@ class BinnedWindow:
         if spans:
             shown = listed(spans, at_most=_MOST_SPANS)
             self.view.notes.add(f"no rows for times in which nothing was recorded: {shown}")
+
+
+def _states_hold_on(view: View, topic: str) -> bool:
+    """Returns whether a topic states something that lasts through silence.
+
+    It is latched, or rare and of texts or booleans. A number of a rare topic is measured anew.
+    """
+    are_states = {TEXT, _BOOLEAN}.issuperset(view.timeline.types_of(topic))
+    return is_latched(view, topic) or (are_states and holds_on(view, [topic]))

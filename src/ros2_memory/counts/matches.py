@@ -41,6 +41,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
 from ros2_memory.counts.labels import BY_LABEL, count_labels, read_labels
 from ros2_memory.history.clock_steps import elapsed_in
+from ros2_memory.history.conditions import condition_of
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
     note_edges,
@@ -59,7 +60,6 @@ from ros2_memory.history.held_values import (
     is_text,
 )
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
-from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import TimeRange, View, clamped, open_search

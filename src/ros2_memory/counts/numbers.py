@@ -32,10 +32,11 @@ from ros2_memory.core.reply import rounded_beside
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
+from ros2_memory.history.conditions import note_no_fix
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.held_values import note_unnamed
 from ros2_memory.history.no_data import no_data_between, require_fields, resolve_topic
-from ros2_memory.history.reverse_search import note_no_fix, note_summarised
+from ros2_memory.history.reverse_search import note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span

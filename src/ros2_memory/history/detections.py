@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
-_LONGEST_LATENCY_NS: Final = 10 * NS_PER_S
+LONGEST_LATENCY_NS: Final = 10 * NS_PER_S
 """A large model may look at an image for this long before it says what is in it."""
 
 
@@ -58,7 +58,7 @@ class Detected(NamedTuple):
         Else the log times: a stamp of another clock cannot be compared with those of transforms.
         """
         latency = self.log_times - self.stamps
-        agrees = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
+        agrees = (latency >= -AGREEMENT_NS) & (latency <= LONGEST_LATENCY_NS)
         return np.where(agrees, self.stamps, self.log_times)
 
     def new_since(self, time: Ns) -> Detected:
@@ -154,7 +154,7 @@ class DetectionRows:
             message = self._view.bags.decode(stored)
             if message is None:
                 continue
-            frame, stamp = extractor.frame(message), _stamp_of(message)
+            frame, stamp = extractor.frame(message), stamp_of(message)
             detections = [
                 detection if detection.frame_id else detection._replace(frame_id=frame)
                 for detection in detections_of(extractor.exact(message, stored.type))
@@ -178,36 +178,22 @@ def seen_at(view: View, stored: StoredMessage) -> Ns:
     counts if it agrees with the log time of the first message that has it.
     """
     topic, stamp = stored.topic, _stamp_or_log_time(view, stored)
-    if -AGREEMENT_NS <= stored.time - stamp <= _LONGEST_LATENCY_NS:
+    if -AGREEMENT_NS <= stored.time - stamp <= LONGEST_LATENCY_NS:
         return stamp
     before = view.stream.last(topic, stored.time)
     if before is not None and _stamp_or_log_time(view, before) == stamp:
-        agreeing = TimeWindow(stamp - AGREEMENT_NS, stamp + _LONGEST_LATENCY_NS + 1)
+        agreeing = TimeWindow(stamp - AGREEMENT_NS, stamp + LONGEST_LATENCY_NS + 1)
         for message in view.stream.messages([topic], agreeing):
             if _stamp_or_log_time(view, message) == stamp:
                 return stamp
     return stored.time
 
 
-def hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
-    """Returns the stamp (ns) of an old message that the newest messages of a window repeat.
-
-    None if the newest message differs from the one before, has no stamp, or is so young that its
-    image may have been looked at until then.
-    """
-    newest = view.stream.newest(topic, window)
-    stamp = None if newest is None else _stamp_of(view.bags.decode(newest))
-    if newest is None or not stamp or newest.time - stamp <= _LONGEST_LATENCY_NS:
-        return None
-    before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
-    repeats = before is not None and before.record.payload == newest.record.payload
-    return stamp if repeats else None
-
-
 def _stamp_or_log_time(view: View, stored: StoredMessage) -> Ns:
-    stamp = _stamp_of(view.bags.decode(stored))
+    stamp = stamp_of(view.bags.decode(stored))
     return stored.time if stamp is None else stamp
 
 
-def _stamp_of(message: object) -> Ns | None:
+def stamp_of(message: object) -> Ns | None:
+    """Returns the header stamp of a message (ns); None if it has none."""
     return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))

@@ -635,7 +635,7 @@ def _poses_of_body(view: View, window: TimeWindow) -> Poses:
             view.notes.add(
                 f"transforms of {names} are left out: none of them moves the robot's body"
             )
-    return poses.rows(_positions_apart(poses.times))
+    return poses.rows(positions_apart(poses.times))
 
 
 def poses_by_session(view: View, window: TimeWindow, session: Session) -> Poses:
@@ -683,13 +683,7 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
     return poses.rows(np.flatnonzero(placed.valid))
 
 
-def sparse_poses_of_body(view: View, window: TimeWindow, session: Session) -> Poses:
-    """Returns the poses of `poses_by_session`, at most twenty a second."""
-    poses = poses_by_session(view, window, session)
-    return poses.rows(_positions_apart(poses.times))
-
-
-def _positions_apart(times: IntArray) -> IntArray:
+def positions_apart(times: IntArray) -> IntArray:
     """Returns the positions of ascending times (ns) that are at least `_STEP_NS` apart."""
     last, positions = MIN_NS, list[int]()
     for position, time in enumerate(times.tolist()):

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
-_BOOLEAN: Final = "std_msgs/msg/Bool"
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
 _MOST_TRIED: Final = 200
@@ -546,15 +545,6 @@ def ends_of_holding(view: View, topic: str) -> list[Ns]:
     """
     silences = (silence for silence in view.snapshot.silences if silence.topic == topic)
     return sorted({*breaks_of(view, topic), *(silence.start for silence in silences)})
-
-
-def states_hold_on(view: View, topic: str) -> bool:
-    """Returns whether a topic states something that lasts through silence.
-
-    It is latched, or rare and of texts or booleans. A number of a rare topic is measured anew.
-    """
-    are_states = {TEXT, _BOOLEAN}.issuperset(view.timeline.types_of(topic))
-    return is_latched(view, topic) or (are_states and holds_on(view, [topic]))
 
 
 def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.poses import NO_POSES, FrameCodes, Poses, joined_poses
+from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
@@ -24,7 +23,7 @@ from ros2_memory.history.scan import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.units import Rows
@@ -110,24 +109,6 @@ def pose_rows(
     counting = (rows for rows in scan(view, topic, window) if among(rows.recording))
     for together in blocks(counting, newest_first=False):
         yield reader.block(together)
-
-
-def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
-    """Returns by file the poses of bags, without bags in which a message has no pose.
-
-    Args:
-        view: of the call.
-        tables: all rows of a topic, of these and other bags.
-        files: the paths of the bags.
-    """
-    reader = PoseReader(view, [])
-    parts: dict[str, list[Poses]] = defaultdict(list)
-    for rows in tables:
-        poses = reader.poses_of_all(rows)
-        for bag, positions in rows.bag_rows(files):
-            of_bag = poses.rows(positions) if poses else reader.poses_of_all(rows.some(positions))
-            parts[bag.file].append(of_bag or NO_POSES)
-    return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
 
 
 class PoseReader:

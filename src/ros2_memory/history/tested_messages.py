@@ -1,4 +1,4 @@
-"""Which messages of topics meet a condition, in blocks over columns."""
+"""Which messages of topics meet a condition, by columns, and in blocks over them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import plain_text
+from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import TruthValues, nowhere
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.reverse_search import RowCondition
-from ros2_memory.history.scan import messages_at, scan
+from ros2_memory.history.scan import decoded_rows, messages_at, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -23,17 +24,23 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.history.reverse_search import ReverseSearch
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import IntArray, Mask
 
 MET: Final = 1
 NOT_MET: Final = 0
 UNKNOWN: Final = 2
 """The message cannot be decoded."""
 
+MOST_UNSURE: Final = 32
+"""Up to this many unsure rows of a part are left to their messages; for more, bags are decoded."""
+_MOST_LEFT: Final = 0.5
+"""If the columns of a bag leave a larger share unsure, bags of that type are not decoded again."""
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that must be read from the bag, and are no farther apart, are read at once."""
 
@@ -69,18 +76,86 @@ class Block(NamedTuple):
     tested: Callable[[], Tested]
 
 
+class RowCondition:
+    """Finds which rows of scans meet a condition, by their columns.
+
+    Large topics do not have all of their columns in the store. If these leave many rows unsure,
+    their bags are decoded: their columns mostly tell. Rows that stay unsure are left to the
+    messages.
+
+    Args:
+        view: of the call.
+        condition: what is asked.
+    """
+
+    def __init__(self, view: View, condition: Condition) -> None:
+        self._view = view
+        self._test = ColumnCondition(condition, view.extractor)
+        self._left_to_messages: set[str] = set()
+
+    def may_match(self, parts: PartZones) -> bool | Mask:
+        """Returns which parts may have a row that meets it, by their zones."""
+        return self._test.may_match(parts)
+
+    def unstated(self, rows: Rows) -> Mask:
+        """Returns which rows of the table lack the field; of rows that count alone, if decoded.
+
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        unstated = self._test.unstated(rows.table)
+        if unstated is not None:
+            return unstated
+        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        unstated = np.zeros(len(rows.table), np.bool_)
+        for positions, decoded in decoded_rows(self._view, rows):
+            of_bag = self._test.unstated(decoded.table)
+            if of_bag is not None:
+                unstated[index[positions]] = of_bag[decoded.index]
+        return unstated
+
+    def truth(self, rows: Rows) -> TruthValues:
+        """Returns which rows of the table meet the condition.
+
+        Bags are decoded only for rows that count.
+
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        truth, channel = self._test.truth(rows.table), rows.table.channel
+        is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
+        if not is_stored or channel.type in self._left_to_messages or truth.is_settled:
+            return truth
+        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        unsure = np.flatnonzero(truth.unsure[index])
+        if unsure.size <= MOST_UNSURE:
+            return truth
+        surely, perhaps = truth.surely.copy(), truth.perhaps.copy()
+        for positions, decoded in decoded_rows(self._view, rows.some(unsure)):
+            in_table = index[unsure[positions]]
+            of_bag, in_bag = self._test.truth(decoded.table), decoded.index
+            surely[in_table], perhaps[in_table] = of_bag.surely[in_bag], of_bag.perhaps[in_bag]
+            if (perhaps & ~surely)[in_table].mean() > _MOST_LEFT:
+                self._left_to_messages.add(channel.type)
+                break
+        return TruthValues(surely, perhaps)
+
+
 class MatchTester:
-    """Tests the messages of the topics of a search.
+    """Tests the messages of topics by columns, and else by `matches`.
 
     Attributes:
         ruled_out: whether columns showed for any message that it does not match.
     """
 
-    def __init__(self, view: View, search: ReverseSearch) -> None:
+    def __init__(
+        self, view: View, condition: Condition, matches: Callable[[StoredMessage], bool | None]
+    ) -> None:
         self.ruled_out = False
         self._view = view
-        self._search = search
-        self._test = RowCondition(view, search.condition)
+        self._condition = condition
+        self._matches = matches
+        self._test = RowCondition(view, condition)
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
@@ -137,10 +212,10 @@ class MatchTester:
         edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
         for neighbours in np.split(undecided, edges) if undecided.size else ():
             for nth, message in messages_at(self._view, rows.some(neighbours)):
-                is_match = self._search.matches(message)
+                is_match = self._matches(message)
                 met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
         tested = Tested(rows.times, met, np.full(len(rows), source))
-        if topic in self._view.moving_topics and plain_text(self._search.condition.test):
+        if topic in self._view.moving_topics and plain_text(self._condition.test):
             # A message of transforms that does not name a frame says nothing of it.
             return rows_of(tested, met == MET)
         return tested

@@ -36,11 +36,11 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTim
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.conditions import newest_above
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import held_at, is_latched
-from ros2_memory.history.reverse_search import newest_above
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     action_of,

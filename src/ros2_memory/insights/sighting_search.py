@@ -189,7 +189,7 @@ def find_runs(
         NoDataError: none of the topics' messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
-    tester = MatchTester(view, search)
+    tester = MatchTester(view, search.condition, search.matches)
     # Messages outside of a scope are not read, and may well be decodable.
     tester.ruled_out = scope.is_bounded
     topics, is_log = search.topics, view.timeline.is_log

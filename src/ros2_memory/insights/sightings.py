@@ -23,6 +23,8 @@ from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
+from ros2_memory.history.condition_hints import compared_frames
+from ros2_memory.history.conditions import condition_of
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import (
@@ -34,7 +36,7 @@ from ros2_memory.history.held_values import (
     note_unnamed,
 )
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
-from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, View, clamped, open_search

@@ -32,6 +32,7 @@ from ros2_memory.analysis.motion.robot_track import (
 )
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
+from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
@@ -42,10 +43,11 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.detections import DetectionRows
 from ros2_memory.history.driven_path import (
     body_by_transforms,
+    poses_by_session,
+    positions_apart,
     resolve_path_topic,
-    sparse_poses_of_body,
 )
-from ros2_memory.history.poses import poses_by_bag
+from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_by_bag, toggle_sentence
@@ -56,17 +58,17 @@ from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SightReader, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.poses import Poses
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.detections import Detected
+    from ros2_memory.history.sessions import Session
     from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
@@ -203,12 +205,12 @@ class RowMaker:
         view = self._view
         if self._body is None:
             rows = scan(view, self._path_topic, window, copies=True)
-            return poses_by_bag(view, rows, {bag.file for bag in bags})
+            return _poses_by_bag(view, rows, {bag.file for bag in bags})
         poses = {}
         for bag in bags:
             session = view.sessions.session_of(bag.recording)
             of_bag = TimeWindow(bag.start, bag.end + 1)
-            poses[bag.file] = sparse_poses_of_body(view, of_bag, session)
+            poses[bag.file] = _sparse_poses(view, of_bag, session)
         return {file: of_bag for file, of_bag in poses.items() if len(of_bag)}
 
     def _rows_of_bag(
@@ -555,3 +557,27 @@ class _Messages:
             "has_payloads": payloads is not None,
             "packed": packed,
         }
+
+
+def _poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
+    """Returns by file the poses of bags, without bags in which a message has no pose.
+
+    Args:
+        view: of the call.
+        tables: all rows of a topic, of these and other bags.
+        files: the paths of the bags.
+    """
+    reader = PoseReader(view, [])
+    parts: dict[str, list[Poses]] = defaultdict(list)
+    for rows in tables:
+        poses = reader.poses_of_all(rows)
+        for bag, positions in rows.bag_rows(files):
+            of_bag = poses.rows(positions) if poses else reader.poses_of_all(rows.some(positions))
+            parts[bag.file].append(of_bag or NO_POSES)
+    return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
+
+
+def _sparse_poses(view: View, window: TimeWindow, session: Session) -> Poses:
+    """Returns the poses of `poses_by_session`, at most twenty a second."""
+    poses = poses_by_session(view, window, session)
+    return poses.rows(positions_apart(poses.times))

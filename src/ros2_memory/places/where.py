@@ -27,15 +27,12 @@ from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
 from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
+from ros2_memory.history.condition_hints import compared_frames
+from ros2_memory.history.conditions import condition_of, types_matching
 from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
-from ros2_memory.history.reverse_search import (
-    ReverseSearch,
-    compared_frames,
-    condition_of,
-    types_matching,
-)
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.history.tested_messages import MET, UNKNOWN, MatchTester, Tested
@@ -423,7 +420,7 @@ class _ConditionStates:
         if types_matching(view, topic) == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
-        self._tester = MatchTester(view, self.search)
+        self._tester = MatchTester(view, self.search.condition, self.search.matches)
         self._holds_on = holds_on(view, self.search.topics)
         break_times = ends_of_holding if self._holds_on else deletions
         # After these log times it is not known what the topics say, until their next message.

@@ -9,11 +9,13 @@ import difflib
 import re
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
+from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
@@ -34,17 +36,13 @@ from ros2_memory.core.text import (
     still_quoted,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.condition_hints import constants_named, position_frames, schemas_of
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.detections import hung_since
+from ros2_memory.history.detections import LONGEST_LATENCY_NS, stamp_of
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import matching_topics
-from ros2_memory.history.reverse_search import (
-    ReverseSearch,
-    named_numbers,
-    position_frames,
-    score_limit,
-)
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.silences import describe_silences
@@ -53,7 +51,7 @@ from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.stored_message import StoredMessage
@@ -61,6 +59,8 @@ if TYPE_CHECKING:
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
+_MOST_TYPES: Final = 3
+"""The constants of this many types are looked up: each reads the channels of a file."""
 _ARTICLE: Final = re.compile(r"^(?:an?|the) ")
 _UNDECODED: Final = Reason(
     "could not be decoded, so detections in them are not known", "topic", of="messages of "
@@ -165,12 +165,27 @@ def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each detector that repeats one message at the end of a window."""
     for topic in topics_with_detections(view.timeline):
         with suppress(NotInLakeError):
-            since = hung_since(view, topic, window)
+            since = _hung_since(view, topic, window)
             if since is not None:
                 yield (
                     f"{topic} repeats its message of {unix_text(since)} again and again: its "
                     "detector seems to hang, and what it saw since then is not known"
                 )
+
+
+def _hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
+    """Returns the stamp (ns) of an old message that the newest messages of a window repeat.
+
+    None if the newest message differs from the one before, has no stamp, or is so young that its
+    image may have been looked at until then.
+    """
+    newest = view.stream.newest(topic, window)
+    stamp = None if newest is None else stamp_of(view.bags.decode(newest))
+    if newest is None or not stamp or newest.time - stamp <= LONGEST_LATENCY_NS:
+        return None
+    before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
+    repeats = before is not None and before.record.payload == newest.record.payload
+    return stamp if repeats else None
 
 
 def notes_on_never(
@@ -191,11 +206,42 @@ def notes_on_never(
     heights = position_frames(view, topics) if condition.field == "position.z" else ()
     frames = {frame for _, of_topic in heights for frame in of_topic}
     return (
-        *score_limit(condition, min_score),
-        *named_numbers(view, topics, condition),
+        *_score_limit(condition, min_score),
+        *_named_numbers(view, topics, condition),
         *(note for frame in sorted(frames) for note in axes_of(frame)),
         *meant,
     )
+
+
+def _score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
+    """Returns a note for "never" if the least score was not asked for, or is above 1."""
+    if not condition.min_score or (min_score is not None and min_score <= 1):
+        return ()
+    unless = "and most scores are from 0 to 1" if min_score else "unless min_score is given"
+    return (f"detections with a score below {condition.min_score:g} do not count here, {unless}",)
+
+
+def _named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns a note for "never" if constants of the topics' types have the word of the condition.
+
+    Then a number stands for the word.
+    """
+    test = condition.test
+    word = test.folded if isinstance(test, Contains | Equals) else None
+    if condition.field or not word:
+        return ()
+    # The statuses of goals are searched by their words.
+    types = sorted({*chain.from_iterable(map(view.timeline.types_of, topics))} - {GOALS})
+    named = {
+        constant: type_name
+        for type_name in types[:_MOST_TYPES]
+        for schema in schemas_of(view, type_name)
+        for constant in constants_named(schema, "", word)
+    }
+    if not named:
+        return ()
+    of_types = listed([f"{constant} ({type_name})" for constant, type_name in named.items()])
+    return (f"{abbreviate(word)} names {of_types}: ask equals on the field of that number",)
 
 
 def _found_otherwise_spelt(

@@ -1,0 +1,145 @@
+"""What a condition may be about: constants of message definitions, and frames of positions."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.conditions import Condition, NearPosition
+from ros2_memory.core.errors import BagError, InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.text import abbreviate, listed
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.view import View
+    from ros2_memory.storage.base import Schema
+
+_ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
+_CONSTANT: Final = re.compile(
+    r"^[ \t]*(?:u?int[0-9]+|byte|char)[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\s*(?:#|$)",
+    re.MULTILINE,
+)
+"""A constant that is a whole number, in the text of a message definition, as ROS 2 writes it."""
+_CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
+_NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
+_MOST_FRAMES: Final = 3
+"""The frames of this many topics are named: each reads one message."""
+
+
+def constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
+    """Returns the number of a constant if the value is its name and the field a number.
+
+    Else returns the value.
+    """
+    word = value.strip() if isinstance(value, str) else ""
+    if not _CONSTANT_NAME.fullmatch(word):
+        return value
+    shown, _, below = field.partition(".")
+    path = below or ".".join(view.extractor.fields_of(type_name).get(shown, (shown,)))
+    _, _, name = path.rpartition(".")
+    number_field = re.compile(_NUMBER_FIELD.format(re.escape(name)), re.MULTILINE)
+    texts = [_text_of(schema) for schema in schemas_of(view, type_name)]
+    numbers = {
+        number
+        for text in texts
+        if number_field.search(text)
+        for constant, number in _CONSTANT.findall(text)
+        if constant == word
+    }
+    return int(numbers.pop()) if len(numbers) == 1 else value
+
+
+def schemas_of(view: View, type_name: str) -> list[Schema]:
+    """Returns the definitions of a type in the first and the last file that have it.
+
+    They differ after an update of the robot. None are returned of a damaged file.
+    """
+    timeline = view.timeline
+    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
+    if topic is None:
+        return []
+    schemas: list[Schema] = []
+    first, last = (find(topic, type_name) for find in (timeline.first_with, timeline.last_with))
+    for path in dict.fromkeys((first.path, last.path)):
+        with suppress(BagError):
+            channels = view.memory.reader.channels(path)
+            schemas += [channel.schema for channel in channels if channel.type == type_name]
+    return schemas
+
+
+def _text_of(schema: Schema) -> str:
+    return schema.text.decode("utf-8", "replace")
+
+
+def constants_named(schema: Schema, field: str, word: str) -> list[str]:
+    """Returns the constants of a definition that a word names, with their values.
+
+    A constant whose whole name is the word, or the field and the word, comes alone. Else all are
+    returned that have the word between underscores.
+    """
+    wanted = "_".join(word.upper().split())
+    constants = dict.fromkeys(_CONSTANT.findall(_text_of(schema))) if wanted else {}
+    whole_names = {wanted, f"{field.upper()}_{wanted}"}
+    named = [(name, value) for name, value in constants if name in whole_names]
+    if not named:
+        named = [(name, value) for name, value in constants if f"_{wanted}_" in f"_{name}_"]
+    return [f"{name} = {value}" for name, value in named]
+
+
+def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns a note on the frames in which `near_position` compared; none for another test."""
+    if not isinstance(condition.test, NearPosition):
+        return ()
+    named = [f"{', '.join(frames)} ({topic})" for topic, frames in position_frames(view, topics)]
+    if not named:
+        return ()
+    axes = "x and y" if condition.test.z is None else "x, y and z"
+    note = (
+        f"near_position compared {axes} (within {condition.test.tolerance_m:g} m) in the frame of "
+        f"each message: {listed(named)}; {_ELSEWHERE}"
+    )
+    return (note,)
+
+
+def require_frame(view: View, topics: Sequence[str], condition: Condition) -> None:
+    """Checks that a topic has positions in the frame that `near_position` names, if it does.
+
+    Raises:
+        InvalidArgumentsError: a topic has positions in other frames.
+    """
+    asked = condition.test.frame_id if isinstance(condition.test, NearPosition) else None
+    if not asked:
+        return
+    for topic, frames in position_frames(view, topics):
+        if asked.lstrip("/") not in {frame.lstrip("/") for frame in frames}:
+            raise InvalidArgumentsError(
+                f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
+                f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
+            )
+
+
+def position_frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Returns the topics that have positions, with the frames of these; reads the first few."""
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    return [(topic, of_topic) for topic, of_topic in frames if of_topic]
+
+
+def _frames_of_newest(view: View, topic: str) -> list[str]:
+    """Returns the frames of the positions in a topic's newest message; none if unknown."""
+    try:
+        stored = view.stream.last(topic)
+    except QueryTimeoutError:
+        return []
+    message = None if stored is None else view.bags.decode(stored)
+    if stored is None or message is None:
+        return []
+    extractor, type_name = view.extractor, stored.type
+    own_frame = extractor.frame(message)
+    seen = detections_of(extractor.exact(message, type_name), own_frame)
+    frames = {detection.frame_id for detection in seen if detection.place is not None}
+    pose = extractor.pose(message, type_name)
+    return sorted(filter(None, frames or {own_frame if pose is None else pose.frame_id}))
