@@ -14,10 +14,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
+from ros2_memory.analysis.clock_steps import across_steps, while_recorded
 from ros2_memory.analysis.conditions import NearPosition
 from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, length_notes
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.errors import (
@@ -39,7 +40,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
-from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
+from ros2_memory.history.clock_steps import clock_steps, elapsed_in
 from ros2_memory.history.condition_hints import compared_frames, position_frames
 from ros2_memory.history.conditions import condition_of, note_no_fix, types_matching
 from ros2_memory.history.coverage import (
@@ -59,7 +60,6 @@ from ros2_memory.history.driven_path import (
     body_at,
     body_of,
     driven_path,
-    length_notes,
     newest_of_body,
     no_path,
     resolve_path_topic,

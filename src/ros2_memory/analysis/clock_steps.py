@@ -12,10 +12,13 @@ stalls. Two things show a step:
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.motion.odometry import GAP_NS, GAP_PERIODS
+from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 
 if TYPE_CHECKING:
@@ -77,6 +80,52 @@ class Elapsed:
     def skipped_between(self, start: Ns, stop: Ns) -> Ns:
         """Returns how much time (ns) the clock skipped between two log times."""
         return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)
+
+
+def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
+    """Returns the trajectory of a path without the steps of the clock: no gaps, and no time.
+
+    A step counts as a gap if it is longer than the usual time between poses explains; see
+    `odometry`.
+    """
+    skipped = elapsed.skipped_between(path.first, path.last)
+    if not skipped or trajectory.poses < 2:
+        return trajectory
+    totals = trajectory.totals
+    usual_s = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
+    counted_as_gaps = [
+        stop - begin
+        for begin, stop in elapsed.skipped
+        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > usual_s
+    ]
+    gaps = max(0, totals.gaps - len(counted_as_gaps))
+    gap_ns = totals.gap_ns - sum(counted_as_gaps)
+    without_gaps = replace(
+        totals,
+        gaps=gaps,
+        gap_m=totals.gap_m if gaps else 0.0,
+        gap_ns=gap_ns if gap_ns > GAP_NS else 0,
+    )
+    elapsed_s = totals.duration_s - unix_from_ns(skipped)
+    avg_speed = mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed
+    return replace(trajectory, totals=without_gaps, avg_speed=avg_speed)
+
+
+def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
+    """Returns a trajectory whose mean speed leaves out the time of gaps (`gap_ns`).
+
+    Its length leaves out the metres across gaps as well.
+    """
+    gap_ns = trajectory.totals.gap_ns
+    recorded = elapsed.between(path.first, path.last) - gap_ns
+    if not gap_ns or recorded <= 0:
+        return trajectory
+    avg_speed, fastest = mean_speed(trajectory.totals.distance_m, unix_from_ns(recorded)), None
+    if trajectory.max_speed_from == "twist":
+        fastest = trajectory.max_speed
+    elif avg_speed is not None:
+        fastest = max(trajectory.max_speed or 0.0, avg_speed)
+    return replace(trajectory, avg_speed=avg_speed, max_speed=fastest)
 
 
 def delay_change(hole: Span, log_times: IntArray, stamps: IntArray) -> Ns | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,8 +18,7 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import GAP_NS, GAP_PERIODS, are_places
-from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
+from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.columns.table import Texts
@@ -30,7 +28,6 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import of_columns, scan
@@ -44,6 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.arrays import Ints
+    from ros2_memory.core.timebase import Ns, Span
     from ros2_memory.history.view import View
 
 _MOST_SUSPECTS: Final = 32
@@ -103,52 +101,6 @@ def _steps_in_time(view: View, window: TimeWindow) -> list[ClockStep] | None:
             "out of time before it was known whether the clock was set: durations are by the clock"
         )
         return None
-
-
-def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
-    """Returns the trajectory of a path without the steps of the clock: no gaps, and no time.
-
-    A step counts as a gap if it is longer than the usual time between poses explains; see
-    `odometry`.
-    """
-    skipped = elapsed.skipped_between(path.first, path.last)
-    if not skipped or trajectory.poses < 2:
-        return trajectory
-    totals = trajectory.totals
-    usual_s = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
-    counted_as_gaps = [
-        stop - begin
-        for begin, stop in elapsed.skipped
-        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > usual_s
-    ]
-    gaps = max(0, totals.gaps - len(counted_as_gaps))
-    gap_ns = totals.gap_ns - sum(counted_as_gaps)
-    without_gaps = replace(
-        totals,
-        gaps=gaps,
-        gap_m=totals.gap_m if gaps else 0.0,
-        gap_ns=gap_ns if gap_ns > GAP_NS else 0,
-    )
-    elapsed_s = totals.duration_s - unix_from_ns(skipped)
-    avg_speed = mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed
-    return replace(trajectory, totals=without_gaps, avg_speed=avg_speed)
-
-
-def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
-    """Returns a trajectory whose mean speed leaves out the time of gaps (`gap_ns`).
-
-    Its length leaves out the metres across gaps as well.
-    """
-    gap_ns = trajectory.totals.gap_ns
-    recorded = elapsed.between(path.first, path.last) - gap_ns
-    if not gap_ns or recorded <= 0:
-        return trajectory
-    avg_speed, fastest = mean_speed(trajectory.totals.distance_m, unix_from_ns(recorded)), None
-    if trajectory.max_speed_from == "twist":
-        fastest = trajectory.max_speed
-    elif avg_speed is not None:
-        fastest = max(trajectory.max_speed or 0.0, avg_speed)
-    return replace(trajectory, avg_speed=avg_speed, max_speed=fastest)
 
 
 def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:

@@ -16,7 +16,6 @@ from ros2_memory.analysis.frames import Edges, FrameTree, joined_edges
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
     PathSlice,
-    Trajectory,
     joined_slices,
     path_slice,
 )
@@ -36,7 +35,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
@@ -273,45 +272,6 @@ def pose_slices(newest_first: Iterable[PoseRows], beside: Ns) -> Iterator[PoseSl
             waiting.discard(number)
             near = [rows for rows in reversed(recent) if rows.last >= first and rows.first < last]
             yield PoseSlice(start, stop, beside, near)
-
-
-def length_notes(path: Trajectory) -> Iterator[str]:
-    """Yields sentences on what the length of a path leaves out, and on what makes it uncertain."""
-    totals = path.totals
-    if path.invalid:
-        poses = counted(path.invalid, "pose")
-        yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
-    if path.is_noisy:
-        # Without numbers, so that several windows share one note; the reply has them.
-        yield (
-            "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
-        )
-    if path.avg_speed is None and path.poses:
-        within = "" if path.poses == 1 else f" within {totals.duration_s:.3f} s"
-        yield f"{counted(path.poses, 'pose')}{within}: too short to say how fast"
-    if totals.is_uncertain:
-        yield (
-            "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "
-            "of the steps: distance_m may be too long, because noise cannot be removed"
-        )
-    if totals.gaps:
-        without = "without a valid pose" if path.invalid else "without a pose"
-        across = f", {totals.gap_m:.2f} m across in straight lines (gap_m): left out of distance_m"
-        if path.gap_m is None:
-            across = (
-                ": left out of distance_m, and of unknown length, as odometry may have begun anew"
-            )
-        yield f"{counted(totals.gaps, 'gap')} {without}{across}"
-    if totals.jumps:
-        yield (
-            f"{counted(totals.jumps, 'jump')} of {totals.jumped_m:.2f} m in all, faster than is "
-            "plausible, left out of distance and speed"
-        )
-    if totals.resets:
-        yield (
-            f"odometry restarted {counted(len(totals.resets), 'time')}: "
-            "the jumps back to its origin are left out of distance and speed"
-        )
 
 
 def note_left_out(view: View, error: UndecodableError) -> None:

@@ -22,6 +22,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
+from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -37,7 +38,7 @@ from ros2_memory.history.coverage import (
     shown_span,
     unix_text,
 )
-from ros2_memory.history.driven_path import length_notes, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.view import View, clamped, open_view
 from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.recap import events_by_topic

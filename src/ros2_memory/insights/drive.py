@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.clock_steps import across_steps
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
@@ -37,7 +38,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.clock_steps import across_steps, elapsed_in
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import reached, recording_gaps
 from ros2_memory.history.driven_path import (
     PoseSlice,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
 from ros2_memory.analysis.goals import FAILURES
 from ros2_memory.analysis.intervals import IntervalTable, united_tables
+from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -35,7 +36,6 @@ from ros2_memory.history.coverage import (
     seconds,
     unexcluded,
 )
-from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.held_values import breaks_of, is_latched
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (

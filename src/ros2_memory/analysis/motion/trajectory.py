@@ -29,6 +29,7 @@ from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import Poses, headings, joined_poses
 from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stable_order, stacked
 from ros2_memory.core.geometry import simplified
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -327,6 +328,45 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
         replace(line, metres=metres, jumps=jumps),
         max(part.error_m for part in slices),
     )
+
+
+def length_notes(path: Trajectory) -> Iterator[str]:
+    """Yields sentences on what the length of a path leaves out, and on what makes it uncertain."""
+    totals = path.totals
+    if path.invalid:
+        poses = counted(path.invalid, "pose")
+        yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
+    if path.is_noisy:
+        # Without numbers, so that several windows share one note; the reply has them.
+        yield (
+            "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
+        )
+    if path.avg_speed is None and path.poses:
+        within = "" if path.poses == 1 else f" within {totals.duration_s:.3f} s"
+        yield f"{counted(path.poses, 'pose')}{within}: too short to say how fast"
+    if totals.is_uncertain:
+        yield (
+            "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "
+            "of the steps: distance_m may be too long, because noise cannot be removed"
+        )
+    if totals.gaps:
+        without = "without a valid pose" if path.invalid else "without a pose"
+        across = f", {totals.gap_m:.2f} m across in straight lines (gap_m): left out of distance_m"
+        if path.gap_m is None:
+            across = (
+                ": left out of distance_m, and of unknown length, as odometry may have begun anew"
+            )
+        yield f"{counted(totals.gaps, 'gap')} {without}{across}"
+    if totals.jumps:
+        yield (
+            f"{counted(totals.jumps, 'jump')} of {totals.jumped_m:.2f} m in all, faster than is "
+            "plausible, left out of distance and speed"
+        )
+    if totals.resets:
+        yield (
+            f"odometry restarted {counted(len(totals.resets), 'time')}: "
+            "the jumps back to its origin are left out of distance and speed"
+        )
 
 
 def draw_waypoints(
