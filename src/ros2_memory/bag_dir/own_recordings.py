@@ -29,12 +29,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import AfterValidator, StrictBool
 
-from ros2_memory.bag_dir.durable_write import (
-    append_lines,
-    flush,
-    locked,
-    write_durably,
-)
+from ros2_memory.bag_dir.durable_write import append_lines, flush, locked
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, give_to_owner, state_path
 from ros2_memory.bag_dir.layout import (
@@ -530,13 +525,11 @@ class OwnRecordings:
         self._rows, self._stamp = merged, None
 
     def _write(self, rows: Iterable[ListRow]) -> None:
-        folder = self._path.parent
-        if not folder.is_dir():
-            folder.mkdir(exist_ok=True)
-            give_to_owner(folder, self._bag_dir)
-            flush(folder.parent)
-        write_durably(self._path, LIST.text(rows))
-        give_to_owner(self._path, self._bag_dir)
+        is_new = not is_folder(self._path.parent)
+        LIST.replace(self._bag_dir, rows)
+        if is_new:
+            give_to_owner(self._path.parent, self._bag_dir)
+            flush(self._bag_dir)
 
     def _failure(self, error: OSError, verb: str = "written") -> RecorderError:
         return RecorderError(

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.bag_dir import own_recordings
+from ros2_memory.bag_dir import json_files, own_recordings
 from ros2_memory.bag_dir.durable_write import locked
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -114,7 +114,7 @@ def test_a_directory_that_was_not_listed_is_ours_where_the_heartbeat_names_it(
     own = OwnRecordings(tmp_path)
     assert not own.owns(tmp_path / A)
     # A list that cannot be written is known all the same.
-    with broken(own_recordings, "write_durably"), capture_logs() as logs:
+    with broken(json_files, "write_durably"), capture_logs() as logs:
         own.claim()
         assert events(logs, "recordings_not_listed")
         assert own.owns(tmp_path / A)
@@ -179,7 +179,7 @@ def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
         patch.setattr(own_recordings, "locked", locked)
         # Another program has the lock, so this one waits.
         OwnRecordings(tmp_path).adopt({"old": old})
-        patch.setattr(own_recordings, "write_durably", failing())
+        patch.setattr(json_files, "write_durably", failing())
         return locked(path)
 
     with monkeypatch.context() as patch:
