@@ -548,19 +548,16 @@ def _value_at_match(
     note_robots_near(days, match)
     matched = _as_value(days, match, (), None)
     until_match = TimeWindow.until(match.time)
-    for view in days_back(days):
-        stored = _newest_of_recording(view, name, until_match, match)
-        if stored is not None:
-            break
-    if stored is None:
+    found = _newest_back(days, name, until_match, match)
+    if found is None:
         note_unread(days, until_match, nothing=True)
         days.notes.add(f"no message of {name} is here at or before {unix_text(match.time)}")
         notes = (*matched.notes, *days.notes.sentences())
         return results.ValueWhen(matched, notes=tuple(dict.fromkeys(notes)))
+    view, stored = found
     stored = newest_stating(view, stored, fields, MIN_NS) or stored
-    since_value = replace(until_match, start=stored.time)
     for shown_days in dict.fromkeys((days, view)):
-        note_unread(shown_days, since_value)
+        note_unread(shown_days, replace(until_match, start=stored.time))
     age = match.time - stored.time
     is_old = age > ns_from_unix(days.limits.time_tolerance_s)
     if is_old and not still_holds(view, stored, match.time):
@@ -568,6 +565,17 @@ def _value_at_match(
     shown = _with_latched_age(view, _as_value(view, stored, fields, None), stored, match.time)
     notes = (*matched.notes, *days.notes.sentences(), *shown.notes)
     return results.ValueWhen(matched, shown, notes=tuple(dict.fromkeys(notes)))
+
+
+def _newest_back(
+    days: View, topic: str, window: TimeWindow, match: StoredMessage
+) -> tuple[View, StoredMessage] | None:
+    """Returns the newest message of a topic in a window, and the view of the days that have it."""
+    for view in days_back(days):
+        stored = _newest_of_recording(view, topic, window, match)
+        if stored is not None:
+            return view, stored
+    return None
 
 
 def list_recorded_topics(

@@ -480,9 +480,6 @@ def test_while_a_goal_was_executing_is_asked_by_that_word(tmp_path: Path) -> Non
     messages.sort(key=lambda message: message.log_time)
     memory = remembered(tmp_path, messages)
 
-    def bumps(kind: str, word: object, **more: object) -> Any:
-
-
     def bumps(kind: str, word: str | int, **more: object) -> Any:
         during = {"topic": TOPIC, "condition_type": kind, "value": word} | more
         question = {"topic": "/bump", "condition_type": "equals", "value": True, "while": during}
