@@ -536,9 +536,10 @@ def _lacks_most(
         if stored is None:
             continue
         tried += 1
+        sought = stored.identity
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
         copies = _merged_messages(view, topic, other, near)
-        if all(copy.identity != stored.identity for copy in copies):
+        if all(copy.identity != sought for copy in copies):
             lacking += 1
         if 2 * lacking > _TRIED:
             return True  # the rest of the sample cannot change that
