@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 from functools import partial
-from itertools import islice
+from itertools import chain
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -170,6 +170,13 @@ class PartHead(NamedTuple):
     is_whole: bool
 
 
+def _keys_of(group: BagRows, bag_dir: str) -> list[Key]:
+    return [
+        (relative(file, bag_dir), *stamps)
+        for file, stamps in zip(group.files(), group.stamps.tolist(), strict=True)
+    ]
+
+
 class ColumnStore(Database):
     """Stores the columns of bags, and finds them again.
 
@@ -257,18 +264,16 @@ class ColumnStore(Database):
             deletion: that of the present `state`; what was loaded at it is still true.
         """
         loaded = [group.take_store_rows(deletion) for group in groups]
-        keys = [
-            (relative(file, bag_dir), *stamps)
+        keys_of_groups = [
+            _keys_of(group, bag_dir) if codes is None else []
             for group, codes in zip(groups, loaded, strict=True)
-            if codes is None
-            for file, stamps in zip(group.files(), group.stamps.tolist(), strict=True)
         ]
-        code_of = self._codes_of(keys) if keys else {}
-        queried = iter([code_of.get(key, -1) for key in keys])
-        for group, known in zip(groups, loaded, strict=True):
+        asked = [*chain.from_iterable(keys_of_groups)]
+        code_of = self._codes_of(asked) if asked else {}
+        for known, keys in zip(loaded, keys_of_groups, strict=True):
             codes = known
             if codes is None:
-                codes = np.fromiter(islice(queried, len(group)), np.int64)
+                codes = np.array([code_of.get(key, -1) for key in keys], np.int64)
             is_stored = codes >= 0
             numbers = np.where(is_stored, (codes >> 1) + self.offset, -1)
             yield StoredBags(numbers, is_stored & (codes & 1 > 0))
