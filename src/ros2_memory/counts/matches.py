@@ -467,7 +467,8 @@ def count_values(
     """
     if len(fields) > 1:
         raise InvalidArgumentsError("by value counts one field: name one in fields")
-    values = HeldValues(view, topic, *fields, asked="by value", until=asked.stop)
+    field = fields[0] if fields else None
+    values = HeldValues(view, topic, field, asked="by value", until=asked.stop)
     start, end = shown_span(view.snapshot, asked)
     stop = end + 1
     try:

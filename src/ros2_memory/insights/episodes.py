@@ -242,7 +242,8 @@ def topic_changes(
         raise InvalidArgumentsError("changes are of one field: name one in fields")
     view, window = open_span(memory, call, span)
     topic = resolve_topic(view, topic)
-    values = HeldValues(view, topic, *fields, asked="changes", until=window.stop)
+    field = fields[0] if fields else None
+    values = HeldValues(view, topic, field, asked="changes", until=window.stop)
     start, _ = window.asked()
     is_all = True
     try:

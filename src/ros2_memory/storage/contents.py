@@ -141,7 +141,7 @@ def _longest_step_back(firsts: Ints, lasts: Ints) -> tuple[Ns, Ns]:
     """Returns how far (ns) a span begins at most before an earlier one ends, and where it begins.
 
     Args:
-        firsts: the first log time of each span, in file order.
+        firsts: the first log time of each of two spans or more, in file order.
         lasts: the last log time of each span.
     """
     steps = np.maximum.accumulate(lasts)[:-1] - firsts[1:]

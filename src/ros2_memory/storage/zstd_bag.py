@@ -205,7 +205,7 @@ def _is_skippable(magic: bytes) -> bool:
 
 
 def _frame_end(file: OpenFile, start: int) -> int | None:
-    """Returns where the frame at `start` ends; None if the file ends before that is known."""
+    """Returns where the frame at `start` ends; None if the file ends before, or has none there."""
     head = file.read(start, min(_HEADER_BYTES, file.size - start))
     if _is_skippable(head[:4]):
         if len(head) < _SKIPPABLE_HEADER.size:
