@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
@@ -154,7 +154,7 @@ class GeodeticPosition:
     longitude: Route
     altitude: Route
     status: Route
-    least: int = 0
+    least: int = field(default=0, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,10 +196,16 @@ UNMAPPED: Final = Plan(
     geodetic=(
         *(
             GeodeticPosition(
-                *(Route(*prefix, name) for name in names), status=Route("status", "status")
+                Route(*prefix, latitude),
+                Route(*prefix, longitude),
+                Route(*prefix, altitude),
+                Route("status", "status"),
             )
             for prefix in ((), ("position",), ("pose", "position"))
-            for names in (("latitude", "longitude", "altitude"), ("lat", "lon", "alt"))
+            for latitude, longitude, altitude in (
+                ("latitude", "longitude", "altitude"),
+                ("lat", "lon", "alt"),
+            )
         ),
         GeodeticPosition(  # as PX4's SensorGps has them; 0 and 1 are no fix
             *map(Route, ("latitude_deg", "longitude_deg", "altitude_msl_m", "fix_type")), least=2
