@@ -205,8 +205,9 @@ def topic_range(
     shown, failures = _show_messages(view, stating.of(picked), fields)
     chosen = len(shown) + failures.total()
     if stating.left_out and not chosen:
+        note_unnamed(view, name, [dict.fromkeys(fields)], window.stop)
         detail = f"the messages of {name} in this time say nothing of {listed(fields)}"
-        raise NoDataError(NoDataReason.BETWEEN_MESSAGES, detail)
+        raise with_notes(view, window, NoDataError(NoDataReason.BETWEEN_MESSAGES, detail))
     chosen += stating.left_out
     if not chosen:
         raise no_data_between(view, (name,), window)
