@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import math
 import os
 from contextlib import suppress
 from functools import partial
@@ -693,8 +694,13 @@ def build_dispatcher(
     memory: Memory,
     telemetry: Telemetry = SILENT,
     fleet: Fleet | None = None,
+    *,
+    is_patient: bool = False,
 ) -> Dispatcher:
-    """Returns the dispatcher of tool calls to a memory, or to the robots of a fleet."""
+    """Returns the dispatcher of tool calls to a memory, or to the robots of a fleet.
+
+    With `is_patient` a call takes as long as it needs, and answers from all that it should read.
+    """
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.build import build_tools, readable_tools
     from ros2_memory.tools.replies import Replies
@@ -718,7 +724,7 @@ def build_dispatcher(
         memory,
         tools,
         Replies(settings.recording.bag_dir, server.max_reply_chars),
-        call_timeout_s=server.call_timeout_s,
+        call_timeout_s=math.inf if is_patient else server.call_timeout_s,
         readable=readable_tools() if additions and fleet is None else (),
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, detected, odom, text, write_mcap
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.program import Program
 
@@ -90,6 +90,24 @@ def test_what_lay_between_recordings_needs_a_folder(
     same = {"same": True, "differing": []}
     assert proved == {"path": str(folder), "messages": 202, **same}
     assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
+
+
+def test_a_proof_has_all_that_an_answer_rests_on_however_long_reading_takes(
+    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server without stored columns would answer from the newest day alone, with a note."""
+    monkeypatch.setattr("ros2_memory.things.known.READING_S", 0.0)
+    for day in range(2):
+        start = BEGIN + day * DAY_S * S
+        seen = [detected(start + nth * S, [("cup", 0.9, (1.0, 0.0, 0.5))]) for nth in range(20)]
+        poses = [odom(start + nth * S // 5, 0.0, 0.0) for nth in range(100)]
+        write_mcap(tmp_path / "bags" / f"rec_{day}" / f"rec_{day}_0.mcap", [*seen, *poses])
+    proof = tmp_path / "proof"
+    proved = exits(0, "prove", "find_things label=cup", "-o", proof, tmp_path / "bags")
+    assert "the same answer" in proved.err
+    [first, second] = sorted(proof.rglob("*.mcap"))
+    for file in (first, second):
+        assert sum(topic != "/odom" for topic, _, _ in messages(file)) == 20
 
 
 @pytest.mark.parametrize(
