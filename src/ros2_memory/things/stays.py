@@ -51,6 +51,10 @@ FEWEST: Final = 3
 _LOWEST_RATE: Final = 0.15
 """A thing that is seen less often than this when looked at is a false detection that repeats."""
 _SAME_PLACE_MM: Final = 450.0
+"""A wrong name is at most this far from its host, ..."""
+_NEAR_MM: Final = 150.0
+_SCATTERS: Final = 2.0
+"""... and no farther than this and so many times the scatter of the host: it is the same thing."""
 _HALO_MM: Final = 950.0
 """A false stay is this near to its host, and under another label at the same place."""
 _SMALL_SHARE: Final = 1 / 3
@@ -290,6 +294,7 @@ class _HostSearch:
         self._count = _column(stay.count for stay in placed)
         self._first = _column(stay.first for stay in placed)
         self._last = _column(stay.last for stay in placed)
+        self._dev_mm = np.array([stay.dev_mm for stay in placed], np.float64)
         self._is_weak = _column(stay.weak for stay in placed) > 0
         self._first_slice = _column(stay.stay.first_slice for stay in placed)
         self._last_slice = _column(stay.stay.last_slice for stay in placed)
@@ -335,7 +340,8 @@ class _HostSearch:
         # Where most messages with one of the label have both, the lighter one is no noise.
         is_tiny &= ~(self._are_several[stay] & is_same) | (2 * count <= hosted)
         is_part = is_tiny | (count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
-        is_part &= (is_same | (away_mm <= _SAME_PLACE_MM)) & (hosted > 0)
+        reach_mm = np.minimum(_NEAR_MM + _SCATTERS * self._dev_mm[host], _SAME_PLACE_MM)
+        is_part &= (is_same | (away_mm <= reach_mm)) & (hosted > 0)
         order = np.lexsort((host, -hosted, stay))
         order = order[is_part[order]]
         return stay[order], host[order]
