@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.spans import united, without
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import (
@@ -150,7 +151,8 @@ def count_visits(
     known = known_track(view, placement.frame_id, window)
     binned.count_since(known.since)
     placed_spans = placed_times(known.track, mixed_spans)
-    binned.add_lengths("placed_s", "duration", placed_spans)
+    # A short gap ends no visit, but then nothing is recorded.
+    binned.add_lengths("placed_s", "duration", without(placed_spans, united(binned.gaps)))
     unknown = unknown_times(view, binned.counted, placed_spans, WHEREABOUTS, mixed=mixed_spans)
     binned.add_unknown(unknown)
     if place is not None and by != "place":

@@ -172,6 +172,16 @@ def test_an_hour_without_poses_has_no_metres_one_in_which_the_robot_stands_has_z
     assert [row[-1] for row in rows] == [pytest.approx(36, abs=0.1), None, 0.0]
 
 
+def test_where_the_robot_was_in_a_short_gap_is_no_recorded_time(tmp_path: Path) -> None:
+    """Two runs of the recorder, 4 s apart, of a robot that stands."""
+    for run, begin in enumerate((0, 64)):
+        poses = [odom(BEGIN + (begin + at) * S, 1.0, 1.0) for at in range(61)]
+        write_mcap(tmp_path / f"run_{run}" / f"run_{run}_0.mcap", poses)
+    counted = asked(memory_of(tmp_path), "visits", x=1, y=1, radius_m=0.5, by="day")
+    whole = table(counted)["all"]
+    assert (whole["recorded_s"], whole["placed_s"], whole["minutes"]) == (120.0, 120.0, 2.07)
+
+
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 1, seconds=300)
     memory = memory_of(tmp_path, limits=QuerySettings(places=NESTED), recalls=True)
