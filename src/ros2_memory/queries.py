@@ -464,7 +464,7 @@ def transform(
 def frames(memory: Memory, call: Call) -> results.Frames:
     """Returns every frame and parent-child pair that was recorded."""
     view = open_view(memory, call, memory.clock.now())
-    edges = view.sessions.edges
+    edges = tuple(view.sessions.edges())
     note_unread(view, TimeWindow.everything(), nothing=True)
     return results.Frames(edges, notes=view.notes.sentences())
 

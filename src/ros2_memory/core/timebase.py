@@ -279,6 +279,17 @@ class WallClock(Clock):
 
 
 @dataclass(frozen=True, slots=True)
+class StoppedClock(Clock):
+    """The time at which a question was asked, so that it is one question, to one or all robots."""
+
+    at: Ns
+
+    def now(self) -> Ns:
+        """Returns that time."""
+        return self.at
+
+
+@dataclass(frozen=True, slots=True)
 class Deadline:
     """The time at which a query must give up.
 

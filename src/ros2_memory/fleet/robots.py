@@ -47,17 +47,6 @@ _GRACE: Final = 0.05
 log = get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class StoppedClock(Clock):
-    """The time at which a question was asked, so that it is one question to all robots."""
-
-    at: Ns
-
-    def now(self) -> Ns:
-        """Returns that time."""
-        return self.at
-
-
 class LakeReport(NamedTuple):
     """What a reply has to report if its answer is from a lake.
 

@@ -17,6 +17,7 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     NS_PER_MS,
     Ns,
+    StoppedClock,
     ns_from_unix,
     unix_from_text,
     unix_rounded_up,
@@ -33,7 +34,7 @@ from ros2_memory.fleet.replies import (
     shared_error,
     shipped_to,
 )
-from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, StoppedClock, robots_clause
+from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, robots_clause
 from ros2_memory.places.where import has_coordinates
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings, ValueWhen
 from ros2_memory.tools.arguments import as_region, as_while

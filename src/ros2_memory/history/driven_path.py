@@ -348,7 +348,7 @@ def robot_body(view: View, session: Session | None = None) -> Body | None:
     if session not in bodies:
         newest = _newest_body(view) if session is None else robot_body(view)
         if session is not None and newest is not None:
-            bodies[session] = _body_of_edges(view, view.sessions.edges_of(session), newest.child)
+            bodies[session] = _body_of_edges(view, view.sessions.edges(session), newest.child)
         else:
             bodies[session] = newest
     return bodies[session]
@@ -356,14 +356,14 @@ def robot_body(view: View, session: Session | None = None) -> Body | None:
 
 def _newest_body(view: View) -> Body | None:
     """Returns the body by the transforms of the newest session that moves it."""
-    body = _body_of_edges(view, view.sessions.edges)
+    body = _body_of_edges(view, view.sessions.edges())
     if body is None:
         return None
     recordings = chain.from_iterable(
         view.timeline.recordings(topic).items() for topic in view.moving_topics
     )
     for path, _ in sorted(recordings, key=lambda recording: recording[1][1], reverse=True):
-        edges = view.sessions.edges_of(view.sessions.session_of(path))
+        edges = view.sessions.edges(view.sessions.session_of(path))
         newest = _body_of_edges(view, edges, body.child)
         if newest is not None:
             return newest._replace(beside=body.beside)

@@ -485,7 +485,7 @@ def _misdated(view: View) -> frozenset[Path]:
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
-    """Whether two recordings hold different messages in a window."""
+    """Whether two recordings each lack most messages of the other's in a window."""
     remembered, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     known = remembered.get(key)
     if known is not None:
@@ -496,28 +496,16 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
         [extent for extent in near if _recording_of(extent.bag, loose) == path] for path in pair
     )
     with view.bags.watched() as reading:
-        differ = bool(first and other) and _bags_differ(view, topic, (first, other), both)
+        # Most, not all: two runs of a simulation share some, while the robot has not moved yet.
+        differ = bool(first and other) and all(
+            _lacks_most(view, topic, here, there, both)
+            for here, there in ((first, other), (other, first))
+        )
     if reading.is_final:
         if len(remembered) >= MOST_REMEMBERED:
             remembered.clear()
         remembered[key] = differ
     return differ
-
-
-def _bags_differ(
-    view: View,
-    topic: str,
-    bags: tuple[Sequence[TopicExtent], Sequence[TopicExtent]],
-    both: TimeWindow,
-) -> bool:
-    """Whether the bags of two recordings each lack most messages of the other's in a window.
-
-    Most, not all: two runs of a simulation share some, while the robot has not moved yet.
-    """
-    first, other = bags
-    return _lacks_most(view, topic, first, other, both) and _lacks_most(
-        view, topic, other, first, both
-    )
 
 
 def _lacks_most(

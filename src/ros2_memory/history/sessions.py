@@ -450,38 +450,31 @@ class Sessions:
         first, last = enclosing(spans)
         return TimeWindow(first, last + 1)
 
-    @cached_property
-    def edges(self) -> tuple[FrameEdge, ...]:
-        """Every recorded pair of parent and child, sorted.
+    def edges(self, session: Session | None = None) -> list[FrameEdge]:
+        """Returns the recorded pairs of parent and child, sorted.
 
-        A pair that was published both as static and as moving is moving. A pair with an unnamed
-        frame is invalid in tf2, and is left out with a note. Another note says if there was no time
-        for older bags.
+        Those of a session; of all without one, or if the pairs of the session were not read. A pair
+        that was published both as static and as moving is moving.
         """
-        edges = self._edges_in(self._pairs_by_folder)
-        named = tuple(edge for edge in edges if is_edge((edge.parent, edge.child)))
-        if len(named) < len(edges):
-            left_out = len(edges) - len(named)
-            self._view.notes.add(f"pairs left out, since a frame has no name: {left_out}")
-        return named
-
-    def edges_of(self, session: Session) -> Sequence[FrameEdge]:
-        """Returns the pairs of a session, as `edges`; of all sessions if its own were not read."""
-        if self._pairs_by_folder.keys().isdisjoint(session - {self._carried}):
-            return self.edges
-        edges = self._edges_in(session)
-        return [edge for edge in edges if is_edge((edge.parent, edge.child))]
-
-    def _edges_in(self, folders: Iterable[str]) -> list[FrameEdge]:
+        by_folder = self._pairs_by_folder
+        own = by_folder.keys() & (session or ())
         pairs: dict[Pair, bool] = {}
-        for folder in folders:
-            for pair, is_static in self._pairs_by_folder.get(folder, {}).items():
+        for folder in own if own - {self._carried} else by_folder:
+            for pair, is_static in by_folder[folder].items():
                 pairs[pair] = is_static and pairs.get(pair, True)
-        return [FrameEdge(*pair, is_static) for pair, is_static in sorted(pairs.items())]
+        return [
+            FrameEdge(*pair, is_static)
+            for pair, is_static in sorted(pairs.items())
+            if is_edge(pair)
+        ]
 
     @cached_property
     def _pairs_by_folder(self) -> Mapping[str, Mapping[Pair, bool]]:
-        """By folder its pairs, and whether each was published as static alone."""
+        """By folder its pairs, and whether each was published as static alone.
+
+        Pairs with an unnamed frame are invalid in tf2: a note counts them. Another note says if
+        there was no time for older bags.
+        """
         view = self._view
         reading = view.call.partial_after(READING_S)
         by_folder: dict[str, dict[Pair, bool]] = defaultdict(dict)
@@ -494,6 +487,9 @@ class Sessions:
                 if reading.expired():
                     view.notes.add_lack("out of time: frames that only older bags have are missing")
                     break
+        unnamed = {pair for pairs in by_folder.values() for pair in pairs if not is_edge(pair)}
+        if unnamed:
+            view.notes.add(f"pairs left out, since a frame has no name: {len(unnamed)}")
         return by_folder
 
     def pairs(self, topics: Iterable[str], session: Session | None = None) -> set[Pair]:

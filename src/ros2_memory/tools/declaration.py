@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
@@ -12,6 +12,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, similar
+from ros2_memory.core.timebase import StoppedClock
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.at_each import at_each, in_each
 from ros2_memory.tools.arguments import (
@@ -317,6 +318,11 @@ class Tool:
         return self.describe()
 
 
+def _ask_at_one_time(question: Question, memory: Memory, call: Call) -> Answer:
+    """Answers a question by one reading of the clock."""
+    return question(replace(memory, clock=StoppedClock(memory.clock.now())), call)
+
+
 def _ask_at_each(
     query: Query,
     arguments: Mapping[str, object],
@@ -450,10 +456,12 @@ class ToolDeclaration:
         query, chosen = self._choose_query(arguments)
         moment = chosen.get("moment")
         if isinstance(moment, AtTime) and moment.each:
-            return partial(_ask_at_each, query, chosen, moment.each)
-        if between is not None:
-            return partial(_ask_in_each, query, chosen, between)
-        return partial(query, **chosen)
+            question: Question = partial(_ask_at_each, query, chosen, moment.each)
+        elif between is not None:
+            question = partial(_ask_in_each, query, chosen, between)
+        else:
+            question = partial(query, **chosen)
+        return partial(_ask_at_one_time, question)
 
     def _choose_query(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
         """Returns the query that answers, and its arguments.

@@ -2,19 +2,22 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.support.clocks import in_zone
+from tests.support.clocks import SettableClock, in_zone
 from tests.support.memories import asked, memory_of
 from tests.support.program import Program, exits
 
 __all__ = ["exits"]
+
+S = NS_PER_S
 
 
 def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does_not(
@@ -31,6 +34,28 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
     found = asked(memory, "find_last_match", before="2026-11-18", **wanted)
     assert found["timestamp"] == hours[1] / NS_PER_S
+
+
+def test_a_call_reads_the_clock_once(tmp_path: Path) -> None:
+    class Counted(SettableClock):
+        read = 0
+
+        def now(self) -> Ns:
+            self.read += 1
+            return self.at
+
+    write_mcap(tmp_path / "bag.mcap", [text(S, "here"), text(9 * S, "there")])
+    memory = memory_of(tmp_path)
+    for tool, given in (
+        ("get_topic_seconds_ago", {"topic": "/chatter", "seconds_ago": 500}),
+        ("get_topic_in_range", {"topic": "/chatter", "start": 3, "end": 90}),
+        ("find_last_match", {"topic": "/chatter", "condition_type": "equals", "value": "no"}),
+        ("recap", {"start": 3, "end": 90}),
+        ("memory_status", {}),
+    ):
+        clock = Counted(20 * S)
+        asked(replace(memory, clock=clock), tool, **given)
+        assert clock.read == 1, tool
 
 
 @pytest.mark.parametrize(
