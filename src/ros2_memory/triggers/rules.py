@@ -402,8 +402,11 @@ class SplitSearch:
         if (rule.name, topic) not in self._tested:
             self._tested.add((rule.name, topic))
             if not matches and condition.can_be_refused:
-                refusal = refusal_for(condition, value)
-                record.problem = None if refusal is None else f"{topic}: {refusal}"
+                refusal, known = refusal_for(condition, value), record.problem or ""
+                if refusal is not None:
+                    record.problem = f"{topic}: {refusal}"
+                elif known.startswith(f"{topic}: "):  # of another condition, or of another type
+                    record.problem = None
         return matches
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
