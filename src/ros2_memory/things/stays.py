@@ -170,11 +170,11 @@ def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, top
     return fields
 
 
-def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
+def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> Floats:
     order = np.argsort(values)
     running = np.cumsum(n[order])
-    ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
-    return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
+    quantiles: Floats = values[order][np.searchsorted(running, np.multiply(shares, running[-1]))]
+    return quantiles
 
 
 def lowest_bin(min_score: float) -> int:
