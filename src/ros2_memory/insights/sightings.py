@@ -477,7 +477,7 @@ def _sighting(
     """Returns a run as a sighting, with the places of the thing and of the robot.
 
     The thing is where its newest match has it; the robot where it was then, or without a thing,
-    where it was at the first match.
+    where it was at the first match, if that is known.
     """
     message = view.memory.reader.decode(newest.record)
     value, detections = _counted_content(view, condition, newest.type, message)
@@ -488,6 +488,9 @@ def _sighting(
     newest_recording = newest.bag.recording
     recording = recording_at(view, newest.topic, at, newest_recording) or newest_recording
     robot = robot_at(view, at, recording, frame_id)
+    if robot is None and robot_at_first:
+        # A recording may begin with the match, and have its first pose only after it.
+        robot, robot_at_first = robot_at(view, run.last, newest_recording, frame_id), False
     return Sighting(
         topic=run.topic,
         first=run.first,

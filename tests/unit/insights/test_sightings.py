@@ -184,6 +184,19 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
+@pytest.mark.parametrize(("first_pose", "at", "x"), [(1, "last_seen", 2.9), (0, "first_seen", 0.0)])
+def test_the_robot_is_where_it_was_last_if_the_first_match_is_before_its_first_pose(
+    tmp_path: Path, first_pose: int, at: str, x: float
+) -> None:
+    """As at the begin of a recording, in which topics come one after the other."""
+    poses = [odom(BEGIN + n * S // 10, n / 10) for n in range(first_pose, 30)]
+    flags = [boolean(BEGIN + n * S // 10 + 1000, True) for n in range(30)]
+    memory = remembered(tmp_path, sorted([*poses, *flags], key=lambda message: message.log_time))
+    is_on = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    [sighting] = asked(memory, "find_matches", **is_on)["sightings"]
+    assert (sighting["robot"]["at"], sighting["robot"]["x"]) == (at, x)
+
+
 @each_way
 def test_a_frame_among_transforms_of_others_is_seen_until_it_is_not_for_long(
     tmp_path: Path, recalls: bool
