@@ -200,10 +200,15 @@ def _parse_override(text: str, source: str, options: Mapping[str, Sequence[str]]
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
-        raise ConfigError(
-            f"{shown} is not a setting (given {source}); write key=value, such as "
-            "server.port=9300, and \"key='value'\" where spaces or special characters are in it"
-        ) from (None if is_secret else error)
+        advice = (
+            "write key=value, such as server.port=9300, and \"key='value'\" where spaces or "
+            "special characters are in it"
+        )
+        if "/" in text and "=" not in text and not is_secret:
+            advice = f"a folder of bags is given as recording.bag_dir={text}"
+        raise ConfigError(f"{shown} is not a setting (given {source}); {advice}") from (
+            None if is_secret else error
+        )
     key = override.key_or_group
     if not key or override.is_sweep_override():
         raise ConfigError(

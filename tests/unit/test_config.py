@@ -294,7 +294,7 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
         ("server.host=${oc.env:NO_SUCH_VARIABLE}", ["server.host: ", "NO_SUCH_VARIABLE"]),
         ("storage=parquet", ["storage: 'parquet'", "mcap, rosbag2"]),
         ("server.port", ["'server.port' is not a setting", "key=value"]),
-        ("/bags/monday", ["is not a setting", "key=value"]),
+        ("/bags/monday", ["is not a setting", "given as recording.bag_dir=/bags/monday"]),
         ("=3", ["'=3' is not one value for one key"]),
         ("data.now=wall,latest", ["is not one value for one key", "key=[a,b]"]),
     ],
