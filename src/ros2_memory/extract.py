@@ -225,6 +225,8 @@ POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
 POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
 _VELOCITY_FRAMES: Final = {**POSE_FRAMES, 3: "body FRD"}
 """The constants of px4_msgs/msg/VehicleOdometry."""
+FRAMES_OF_TYPES: Final = {"px4_msgs/msg/VehicleLocalPosition": "NED"}
+"""The frames of poses that a type's definition gives, while its messages name none."""
 
 
 class SchemaExtractor:
@@ -316,7 +318,8 @@ class SchemaExtractor:
             pose = route.of(message)
             if pose is not None:
                 px4_frame = _px4_frame(plan.pose_frame, message, POSE_FRAMES)
-                return Pose(*pose, self.frame(message) or px4_frame)
+                frame = px4_frame or FRAMES_OF_TYPES.get(type_name, "")
+                return Pose(*pose, self.frame(message) or frame)
         return None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:

@@ -168,6 +168,32 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     assert asked(memory, "find_matches", **above)["notes"].count(note) == 1
 
 
+@each_way
+def test_the_local_position_of_px4_is_in_north_east_down(tmp_path: Path, recalls: bool) -> None:
+    """Its messages name no frame: by its definition it is that one."""
+    type_name = "px4_msgs/msg/VehicleLocalPosition"
+
+    def flown(n: int) -> Msg:
+        numbers = {"x": n / 2, "y": 3.0, "z": -2.0, "heading": 0.0}
+        return Msg(
+            "/flown", type_name, T0 + n * S, make(type_name, timestamp=n, xy_valid=True, **numbers)
+        )
+
+    memory = remembered(tmp_path, [flown(n) for n in range(20)], recalls=recalls)
+    note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
+    for tool, given in (
+        ("get_position_at", {"timestamp": T0_S + 4, "topic": "/flown"}),
+        ("trajectory_summary", {"start": T0_S, "end": T0_S + 19, "topic": "/flown"}),
+    ):
+        reply = asked(memory, tool, **given)
+        assert reply["frame_id"] == "NED"
+        assert note in reply["notes"]
+    near = {"condition_type": "near_position", "value": {"x": 2.0, "y": 3.0}}
+    reply = asked(memory, "find_matches", topic="/flown", **near)
+    assert reply["total"] == 1
+    assert any("frame of each message: NED (/flown)" in note for note in reply["notes"])
+
+
 def localised(n: int, topic: str) -> Msg:
     """A localiser's pose of the robot."""
     type_name = "geometry_msgs/msg/PoseWithCovarianceStamped"

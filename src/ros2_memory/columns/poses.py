@@ -20,6 +20,7 @@ from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShap
 from ros2_memory.core.arrays import Floats, Vectors, row_sums
 from ros2_memory.extract import (
     FRAME,
+    FRAMES_OF_TYPES,
     POSE_FRAMES,
     UNMAPPED,
     Plan,
@@ -85,6 +86,7 @@ class _Columns(NamedTuple):
         turn: of x, y, z and w, or of a heading alone (rad); empty if there is no rotation.
         frame: of the frame in the header, or "".
         numbered_frame: of PX4's number of the frame, or "".
+        usual_frame: the name of the frame itself, where a message has none; or "".
         velocity: of the one to three components of the linear velocity (m/s); empty without one.
     """
 
@@ -92,6 +94,7 @@ class _Columns(NamedTuple):
     turn: tuple[str, ...] = ()
     frame: str = ""
     numbered_frame: str = ""
+    usual_frame: str = ""
     velocity: tuple[str, ...] = ()
 
 
@@ -114,6 +117,7 @@ def _columns_of(plan: Plan, shape: Shape) -> _Columns:
     return pose._replace(
         frame=".".join(FRAME.segments) if has_frame else "",
         numbered_frame=numbered or "",
+        usual_frame=FRAMES_OF_TYPES.get(shape.type, ""),
         velocity=_velocity(plan, shape),
     )
 
@@ -286,7 +290,7 @@ def _at_unit_length(turns: Vectors) -> Vectors:
 
 def _frames_of(rows: _RoundedRows, columns: _Columns, count: int) -> Texts:
     """Returns the frames in the headers, or PX4's frames where these are empty."""
-    frames = Texts(np.zeros(count, np.uint32), ("",) if count else ())
+    frames = Texts(np.zeros(count, np.uint32), (columns.usual_frame,) if count else ())
     if columns.frame:
         frames = rows.texts(columns.frame)
     if not columns.numbered_frame or all(frames.words):
