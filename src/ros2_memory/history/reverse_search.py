@@ -16,6 +16,7 @@ from ros2_memory.analysis.conditions import (
     Condition,
     Contains,
     Equals,
+    at_field,
 )
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.core.errors import (
@@ -309,6 +310,11 @@ class ReverseSearch:
         if newest is None:
             return None
         refusal = refusal_for(condition, value)
+        if refusal is not None and field and self._is_beyond_shown(newest, field):
+            return (
+                f"{field!r} is in the messages of {type_name}, but not among the fields that are "
+                "searched; get_topic_in_range shows it with fields, and its extremes"
+            )
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:
             return refusal
@@ -319,6 +325,14 @@ class ReverseSearch:
         # Without a field, the number would also match in the bytes of an id.
         advice = "" if field else ": ask equals on the field of that number"
         return f"{refusal}, such as {listed(constants)}{advice}"
+
+    def _is_beyond_shown(self, stored: StoredMessage, field: str) -> bool:
+        """Returns whether a message has a field that its value, as replies show it, lacks."""
+        extractor = self._view.extractor
+        message = self._view.bags.decode(stored)
+        if message is None or at_field(extractor.exact(message, stored.type), field):
+            return False
+        return extractor.exact_at(message, stored.type, field) not in (None, [])
 
     def matches(self, stored: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None if it lacks the field, or is not decoded."""

@@ -291,6 +291,23 @@ def test_a_constant_is_refused_without_the_field_of_its_number(tmp_path: Path) -
         last(memory, "equals", "STATUS_ABORTED", "/drive/_action/status")
 
 
+def test_a_field_that_replies_do_not_show_is_refused_with_what_shows_it(tmp_path: Path) -> None:
+    memory = remembered(tmp_path, [odom(T0, 1.0)])
+    limit = {"topic": "/odom", "condition_type": "above", "value": 0.3}
+    for tool in ("find_matches", "find_last_match"):
+        refused = asked(memory, tool, **limit, field="pose.covariance.0")
+        assert refused["detail"] == (
+            "/odom: 'pose.covariance.0' is in the messages of nav_msgs/msg/Odometry, but not among "
+            "the fields that are searched; get_topic_in_range shows it with fields, "
+            "and its extremes"
+        )
+        refused = asked(memory, tool, **limit, field="pose.covariances")
+        assert "the values have no field 'pose.covariances'" in refused["detail"]
+    window = {"topic": "/odom", "start": T0_S, "end": T0_S + 1}
+    shown = asked(memory, "get_topic_in_range", **window, fields=["pose.covariance.0"])
+    assert shown["rows"] == [[T0_S, 0]]
+
+
 @pytest.mark.parametrize("value", [5, True])
 def test_a_number_is_refused_where_all_are_texts_but_not_of_json_that_may_have_one(
     tmp_path: Path, value: JsonValue
