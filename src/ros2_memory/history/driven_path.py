@@ -409,7 +409,7 @@ def body_at(view: View, at: Ns) -> Body | None:
 
 def root_above(view: View, frame: str) -> str | None:
     """Returns the frame that all frames above a frame lead to; None if there is none above it."""
-    above = _ancestors(frame, {edge.child: edge.parent for edge in view.sessions.edges})
+    above = _ancestors(frame, {edge.child: edge.parent for edge in view.sessions.edges()})
     return above[-1] if above else None
 
 
