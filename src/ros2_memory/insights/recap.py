@@ -58,7 +58,7 @@ from ros2_memory.insights.topic_events import (
 )
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
-from ros2_memory.places.where import known_track_for, parse_where
+from ros2_memory.places.where import heard_times, known_track_for, parse_where
 from ros2_memory.results import Before, Event, PastChange, Recap
 
 if TYPE_CHECKING:
@@ -331,6 +331,9 @@ def _reported_events(
         toggles = _toggles(view, topic, topic_events)
         if toggles and is_latched(view, topic):  # a latched value holds through gaps
             events += _flip_events(topic, toggles, breaks_of(view, topic))
+        elif toggles and view.timeline.is_on_events(topic):  # nothing is said between two goals
+            heard = heard_times(view, [topic], window)
+            events += _flip_events(topic, toggles, [stop - 1 for _, stop in heard])
         elif toggles:
             unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
             events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])

@@ -473,6 +473,28 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     assert held("executing", 900, 940) == ([], 0, 0, "None")
 
 
+def test_what_feedback_says_holds_while_there_is_feedback(tmp_path: Path) -> None:
+    """Of two goals, a minute apart; a bumper that is as quiet in between stays pressed."""
+    said = {at: at >= 5 for at in range(8)} | {at: at >= 65 for at in range(60, 68)}
+    messages = [odom(BEGIN + at * S) for at in range(100)]
+    for topic in ("/grip/_action/feedback", "/bumper"):
+        messages += [boolean(BEGIN + at * S, value, topic=topic) for at, value in said.items()]
+    messages.sort(key=lambda message: message.log_time)
+    flips = [
+        each for each in over(remembered(tmp_path, messages), 0, 99).events if each.kind == "flip"
+    ]
+    lasted = [
+        (each.text, (each.start - BEGIN) // S, each.end and (each.end - BEGIN) // S)
+        for each in flips
+    ]
+    assert [row for row in lasted if "feedback" in row[0]] == [
+        ("/grip/_action/feedback became true", 5, 7),
+        ("/grip/_action/feedback became false", 60, 65),
+        ("/grip/_action/feedback became true", 65, 67),
+    ]
+    assert [row[1:] for row in lasted if "bumper" in row[0]] == [(5, 60), (60, 65), (65, None)]
+
+
 def test_while_a_goal_was_executing_is_asked_by_that_word(tmp_path: Path) -> None:
     """Executing from 10 to 20 s and from 30 to 35 s; the first one stays listed as succeeded."""
     messages = [*history((5, {1: 1}), (10, {1: 2}), (20, {1: 4}), (30, {1: 4, 2: 2}), (35, {2: 6}))]
