@@ -142,7 +142,8 @@ def compare(
         side.view.notes.retract_outside(*windows)
     if region is not None:
         notes.add("way, errors and silent_s are not only of that place")
-    unlisted = this.unlisted, that.unlisted
+    errors = _in_both(sides, this.errors, that.errors)
+    silences = _in_both(sides, this.silences, that.silences)
     return Comparison(
         oldest=min(window.start for window in windows),
         newest=max(window.stop for window in windows),
@@ -152,8 +153,8 @@ def compare(
         things=things,
         way=_differing(this.way, that.way, least=_LEAST),
         places=_differing(*minutes, least=_LEAST_MINUTES),
-        errors=_differing(this.errors, that.errors, least=_LEAST_COUNT, unlisted=unlisted),
-        silences=_differing(this.silences, that.silences, least=_LEAST_SILENT_S, unlisted=unlisted),
+        errors=_differing(*errors, least=_LEAST_COUNT),
+        silences=_differing(*silences, least=_LEAST_SILENT_S),
         way_frame_id=way_frame,
         stood=stood,
         notes=tuple(dict.fromkeys([*notes.sentences(), *that.view.notes.sentences()])),
@@ -189,8 +190,8 @@ class _Side(NamedTuple):
         is_recorded: whether anything was recorded in it.
         placement: the frames of the robot's poses and of places; None without poses.
         way: the numbers of the path by the names in `_LEAST`; None for an unknown number.
-        errors: how often each error was reported, by its text.
-        silences: for how many seconds each topic was silent while the robot was on.
+        errors: how often each error was reported, by its text and then by topic.
+        silences: for how many seconds each topic was silent while the robot was on; as `errors`.
         length_s: how long the window is.
         recorded_s: how much of it was recorded.
     """
@@ -201,15 +202,21 @@ class _Side(NamedTuple):
     drive: Drive
     placement: MapPlacement | None
     way: Mapping[str, float | None]
-    errors: Mapping[str, float]
-    silences: Mapping[str, float]
+    errors: Mapping[str, Mapping[str, float]]
+    silences: Mapping[str, Mapping[str, float]]
     length_s: float
     recorded_s: float
 
-    @property
-    def unlisted(self) -> float | None:
-        """The number of an error that is not listed: 0, or None as nothing was recorded."""
-        return 0.0 if self.is_recorded else None
+    def none_on(self, topics: Iterable[str]) -> float | None:
+        """Returns the number of what is not listed: 0, or None if no topic of it was recorded.
+
+        A log was, if anything was: it has messages only when there is something to say.
+        """
+        timeline = self.view.timeline
+        are_recorded = any(
+            timeline.is_log(topic) or any(timeline.extents(topic, self.window)) for topic in topics
+        )
+        return 0.0 if self.is_recorded and are_recorded else None
 
 
 def _side_of(view: View, window: TimeWindow) -> _Side:
@@ -565,21 +572,41 @@ def _minutes_of(
     return minutes
 
 
-def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
-    """Returns how often each error was reported, by its text."""
-    counts: dict[str, float] = defaultdict(float)
-    for events in events_by_topic(view, window, has_errors).values():
+def _error_counts(view: View, window: TimeWindow) -> Mapping[str, Mapping[str, float]]:
+    """Returns how often each error was reported, by its text and then by topic."""
+    counts: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    for topic, events in events_by_topic(view, window, has_errors).items():
         for error in () if events is None else events.errors:
-            counts[Quoted(error.text)] += error.reports
+            counts[Quoted(error.text)][topic] += error.reports
     return counts
 
 
-def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, float]:
-    """Returns how many seconds each topic was silent while the robot was on."""
-    seconds: dict[str, float] = defaultdict(float)
+def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, Mapping[str, float]]:
+    """Returns how many seconds each topic was silent while the robot was on; as `_error_counts`."""
+    seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for silence in silences_in(view, window):
-        seconds[silence.topic] += unix_from_ns(silence.length)
+        seconds[silence.topic][silence.topic] += unix_from_ns(silence.length)
     return seconds
+
+
+def _in_both(
+    sides: tuple[_Side, _Side], *numbers: Mapping[str, Mapping[str, float]]
+) -> list[dict[str, float | None]]:
+    """Returns for each window the numbers by name, those of the other one's names as well.
+
+    `numbers` are those of each window, by name and then by topic.
+    """
+    topics: dict[str, set[str]] = defaultdict(set)
+    for by_name in numbers:
+        for name, by_topic in by_name.items():
+            topics[name].update(by_topic)
+    return [
+        {
+            name: sum(by_name[name].values()) if name in by_name else side.none_on(topics[name])
+            for name in topics
+        }
+        for side, by_name in zip(sides, numbers, strict=True)
+    ]
 
 
 def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
@@ -593,17 +620,15 @@ def _differing(
     other: Mapping[str, float | None],
     *,
     least: Mapping[str, float] | float,
-    unlisted: Sequence[float | None] = (0.0, 0.0),
 ) -> tuple[tuple[str, Pair], ...]:
     """Returns the numbers that differ, the largest difference first, by name.
 
-    A name that a side lacks has the number in `unlisted` there. A number that is unknown on one
-    side only differs.
+    Both have the same names. A number that is unknown on one side only differs.
     """
     pairs: dict[str, Pair] = {}
     differences: dict[str, float] = {}
-    for name in dict.fromkeys([*this, *other]):
-        one, two = this.get(name, unlisted[0]), other.get(name, unlisted[1])
+    for name, one in this.items():
+        two = other[name]
         pairs[name] = Pair(one, two)
         if one is None or two is None:
             if one is not two:

@@ -368,6 +368,28 @@ def test_a_time_of_a_wrong_clock_is_recorded_as_any_other(tmp_path: Path) -> Non
     assert "recorded only" not in str(asked(memory, "recap", **unset))
 
 
+@each_way
+def test_what_a_topic_reports_that_was_not_recorded_in_a_time_is_unknown_then_not_zero(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Diagnostics and the lidar's topic were taken into the list after ten minutes."""
+    made = [odom(T0 + n * S, 0.0) for n in range(1200)]
+    made += [boolean(T0 + n * S, True, "/heartbeat") for n in range(1200)]
+    made += [bags.diagnostics(T0 + n * S, motor=(2, "hot")) for n in range(600, 1200)]
+    heard = [n for n in range(600, 1200) if not 700 < n < 900]
+    made += [boolean(T0 + n * S, True, "/lidar") for n in heard]
+    made += [log_entry(T0 + 100 * S, 20, "nav", "fine"), log_entry(T0 + 900 * S, 40, "nav", "lost")]
+    bags.write_splits(tmp_path, made, 60)
+    window = {"start": T0_S + 600, "end": T0_S + 1199}
+    memory = memory_of(tmp_path, recalls=recalls)
+    reply = asked(memory, "compare", **window, with_start=T0_S, with_end=T0_S + 599)
+    assert reply["errors"] == {
+        "motor: hot": {"this": 600.0, "with": None},
+        "nav: lost": {"this": 1.0, "with": 0.0},
+    }
+    assert reply["silent_s"] == {"/lidar": {"this": 200.0, "with": None}}
+
+
 def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
