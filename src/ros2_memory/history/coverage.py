@@ -96,18 +96,11 @@ def note_unread(
     if window.empty:
         return
     must_be_complete = nothing or search
-    notes, bag_dir = view.notes, view.bag_dir
-    absent = _absent_files(view) if must_be_complete else ()
-    odd = [
-        bag
-        for bag in view.timeline.faulty(window)
-        # No other note says that a crash left a bag open.
-        if bag.state is BagState.INCOMPLETE or not notes.notes_cover_remarks(bag)
-    ]
+    notes, bag_dir, snapshot = view.notes, view.bag_dir, view.snapshot
     if gaps:
         notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS))
     if must_be_complete:
-        notes.add(*describe_thinned(view.snapshot, window))
+        notes.add(*describe_thinned(snapshot, window))
     if os.path.lexists(bag_dir / OWN_FOLDER):
         deleted = [span_text(*span) for span in deleted_between(view, window)]
         if deleted:
@@ -120,10 +113,47 @@ def note_unread(
         )
     if must_be_complete and _are_losses_hidden(bag_dir):
         notes.add_lack(f"{OWN_FOLDER} cannot be read: what was lost or deleted is not known")
-    notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
+    absent = _absent_files(view) if must_be_complete else ()
+    notes.add(*_describe_unread(snapshot, window, absent, nothing=nothing))
+    _note_odd(view, window)
+
+
+def _note_odd(view: View, window: TimeWindow) -> None:
+    """Notes the bags of a window that are not whole, unless notes on reading them did."""
+    odd = [
+        bag
+        for bag in view.timeline.faulty(window)
+        # No other note says that a crash left a bag open.
+        if bag.state is BagState.INCOMPLETE or not view.notes.notes_cover_remarks(bag)
+    ]
+    view.notes.add(*describe_odd(odd))
     # With more kinds of remarks, the sentences do not have every remark.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
-        notes.add_remarks(odd)
+        view.notes.add_remarks(odd)
+
+
+def _describe_unread(
+    snapshot: Snapshot, window: TimeWindow, absent: Sequence[SetAside], *, nothing: bool
+) -> Iterator[str]:
+    """Yields sentences on the files of a window, and missing ones, that were not read as a whole.
+
+    `nothing`: whether the answer is that there is nothing.
+    """
+    if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
+        names = [
+            f"{short_name(aside.path)} ({shortened(aside.reason)})" for aside in lost[-MAX_NAMED:]
+        ]
+        files = counted(len(lost), "bag file")
+        yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
+    active = being_written(snapshot, window, nothing=nothing)
+    # Splits are not served before they were searched.
+    if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:
+        yield f"{HELD_BACK}: {listed(held)}"
+    if any(aside.reason != HELD_BACK for aside in active):
+        yield _describe_active(snapshot, active, window)
+    faults = [fault for fault in snapshot.misdated if fault.reaches_into(window)]
+    if faults and not nothing:
+        yield describe_misdated(faults)
 
 
 def _are_losses_hidden(bag_dir: Path) -> bool:
@@ -433,41 +463,6 @@ def is_whole(bag: BagFile) -> bool:
         if not is_harmless:
             return False
     return True
-
-
-def unread_spans(
-    snapshot: Snapshot,
-    window: TimeWindow,
-    *,
-    nothing: bool,
-    absent: Sequence[SetAside],
-    odd: Sequence[BagFile],
-) -> Iterator[str]:
-    """Yields sentences on the files that were not read in a window, or not as a whole.
-
-    Args:
-        snapshot: of the bags.
-        window: of log time.
-        nothing: whether the answer is that there is nothing.
-        absent: missing files.
-        odd: bags that are not whole and have to be named.
-    """
-    if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
-        names = [
-            f"{short_name(aside.path)} ({shortened(aside.reason)})" for aside in lost[-MAX_NAMED:]
-        ]
-        files = counted(len(lost), "bag file")
-        yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
-    active = being_written(snapshot, window, nothing=nothing)
-    # Splits are not served before they were searched.
-    if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:
-        yield f"{HELD_BACK}: {listed(held)}"
-    if any(aside.reason != HELD_BACK for aside in active):
-        yield _describe_active(snapshot, active, window)
-    faults = [fault for fault in snapshot.misdated if fault.reaches_into(window)]
-    if faults and not nothing:
-        yield describe_misdated(faults)
-    yield from describe_odd(odd)
 
 
 def lost_in(

@@ -12,9 +12,10 @@ import re
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import pytest
 from hypothesis import given
@@ -33,8 +34,8 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataReason
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.coverage import unread_spans
-from ros2_memory.history.view import TimeRange
+from ros2_memory.history.coverage import note_unread
+from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from tests.support import bags
@@ -390,15 +391,18 @@ def test_what_a_topic_reports_that_was_not_recorded_in_a_time_is_unknown_then_no
     assert reply["silent_s"] == {"/lidar": {"this": 200.0, "with": None}}
 
 
+NO_MEMORY: Final = memory_of(Path("/nowhere"))
+
+
 def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
 
 
 def sentences(snapshot: Snapshot, start: int, stop: int, *, nothing: bool = False) -> list[str]:
-    window = TimeWindow(T0 + start * S, T0 + stop * S)
-    odd = snapshot.timeline.faulty(window)
-    return [*unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd)]
+    view = View(replace(NO_MEMORY, fixed=snapshot), Call())
+    note_unread(view, TimeWindow(T0 + start * S, T0 + stop * S), nothing=nothing, gaps=False)
+    return [*view.notes.sentences()]
 
 
 def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:

@@ -1,6 +1,7 @@
 """How a bag file stands, and files that the recorder holds back: no index serves these."""
 
 import os
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from unittest.mock import Mock
@@ -9,9 +10,10 @@ import pytest
 
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BAG_KINDS, TimeWindow
-from ros2_memory.history.context import QuerySettings, SnapshotSource
-from ros2_memory.history.coverage import describe_excluded, unread_spans
+from ros2_memory.history.context import Call, QuerySettings, SnapshotSource
+from ros2_memory.history.coverage import describe_excluded, note_unread
 from ros2_memory.history.no_data import nothing_here
+from ros2_memory.history.view import View
 from ros2_memory.index.file_state import (
     HELD_BACK,
     RETRY_NS,
@@ -267,9 +269,9 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
         f"{T0 // S + 4}.000000 to {T0 // S + 10}.500001"
     )
     assert [*describe_excluded(bags.bag_dir, TimeWindow(T0, T0 + 3 * S))] == []
-    assert f"{HELD_BACK}: {name}/{name}_1.mcap" in [
-        *unread_spans(index_of(bags).snapshot(), window, nothing=False, absent=(), odd=())
-    ]
+    view = View(replace(memory, fixed=index_of(bags).snapshot()), Call())
+    note_unread(view, window)
+    assert f"{HELD_BACK}: {name}/{name}_1.mcap" in view.notes.sentences()
 
 
 def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:
