@@ -67,11 +67,11 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
 from ros2_memory.history.no_data import (
     accepting,
-    decode,
     describe_lack,
     no_data_at,
     no_data_between,
     require_bags,
+    require_decoded,
     require_recorded,
     resolve_pose_topic,
     resolve_topic,
@@ -287,7 +287,7 @@ def position(
     _require_kind(view, name, "position", "geodetic")
     stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     _note_latched(view, stored, at)
-    message = decode(view, stored)
+    message = require_decoded(view, stored)
     pose, geodetic = view.extractor.pose(message, stored.type), None
     if pose is not None:
         pose = _place_pose(view, stored, pose, frame_id)
@@ -437,7 +437,7 @@ def velocity(
     _require_kind(view, name, "velocity")
     stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     _note_latched(view, stored, at)
-    twist = memory.extractor.twist(decode(view, stored), stored.type)
+    twist = memory.extractor.twist(require_decoded(view, stored), stored.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", stored))
     return results.Velocity(
@@ -454,7 +454,7 @@ def transform(
         transform = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
         raise with_notes(view, TimeWindow.around(at, TF_CACHE_NS), error) from error
-    note_unread(view, TimeWindow.around(at, transform.reach))
+    note_unread(view, TimeWindow.around(at, transform.around))
     age = None if now is None else now - at
     return results.TransformAt(
         parent, child, at, transform.transform, transform.clock, age, notes=view.notes.sentences()
@@ -493,7 +493,7 @@ def find_last_match(
         _note_unsearched(view, match, until, now)
         # The view may show some days of long ago only.
         newest_known = memory.index.published or view.snapshot
-        counted_from = memory.now(now, newest_known.latest, call)
+        counted_from = memory.now(newest_known.latest, call)
         is_future = match.time > counted_from + FUTURE_NS
         if is_future:
             after = seconds(match.time - counted_from)
@@ -651,7 +651,7 @@ def data_time_range(
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
-        now=memory.now(now, snapshot.latest, call),
+        now=memory.now(snapshot.latest, call),
         bags=len(snapshot.bags),
         gaps=gaps_with_deleted(view, unexcluded(view, view.gaps(window))),
         incomplete=left_open(snapshot),
@@ -942,7 +942,7 @@ def _newest_at(
         stored = _thinned_pose(view, topic, window.stop)
     deleted = False
     latching = view.limits.latching
-    if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
+    if stored is None and tolerance_s is None and latching.may_latch(view.snapshot, topic):
         newest = view.stream.last(topic, window.stop)
         if newest is None:
             tolerance = None  # there is none of any age
@@ -1026,7 +1026,7 @@ def _decode_shown(
 ) -> tuple[object, Extracted]:
     """Returns a decoded message, and its fields as replies show them."""
     with view.call.stages.timed("extract"):
-        message = decode(view, stored)
+        message = require_decoded(view, stored)
         return message, view.extractor.shown(message, stored.type, fields)
 
 

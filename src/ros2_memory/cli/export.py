@@ -130,7 +130,7 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     latching = view.limits.latching
     valid: list[StoredMessage] = []
     for topic in topics:
-        if not latching.may_hold(snapshot, topic):
+        if not latching.may_latch(snapshot, topic):
             continue
         if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
             if latching.is_latched(snapshot, topic):

@@ -311,10 +311,9 @@ def open_robot(settings: Settings, name: str, *, verbose: bool) -> "tuple[Settin
 
 def present_time(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
-    now = memory.clock.now()
     if memory.limits.now == "wall":  # A fleet has no bags of its own, which a scan would report.
-        return now
-    return memory.now(now, memory.index.snapshot().dating.latest)
+        return memory.clock.now()
+    return memory.now(memory.index.snapshot().dating.latest)
 
 
 def parse_duration(text: str) -> float | None:

@@ -28,7 +28,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import note_unread, reached, recording_gaps
+from ros2_memory.history.coverage import note_unread, recording_gaps, shown_window
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View, open_view
@@ -221,7 +221,7 @@ def recorded_part(memory: Memory, window: TimeWindow) -> PlotWindow:
         NoDataError: nothing is recorded, or nothing in that window.
     """
     view = open_view(memory, Call(), window.stop)
-    part = reached(view.snapshot, window)
+    part = shown_window(view.snapshot, window)
     if part.empty:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing was recorded in this time")
     return PlotWindow(view, part)

@@ -34,9 +34,9 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
-    reached,
     recording_gaps,
     shown_span,
+    shown_window,
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -331,7 +331,7 @@ class BinnedWindow:
         start, end = shown_span(view.snapshot, asked)
         if end < start:
             raise no_data_between(view, self._topics, asked)
-        self.counted = reached(view.snapshot, asked)
+        self.counted = shown_window(view.snapshot, asked)
         # The end is left out: a window until midnight has no bin of the next day. `TimeBins.pieces`
         # takes what happens at the very end into the last bin.
         self.window = TimeWindow(start, max(end, start + 1))

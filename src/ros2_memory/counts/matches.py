@@ -46,9 +46,9 @@ from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
-    reached,
     recording_gaps,
     shown_span,
+    shown_window,
     unix_text,
 )
 from ros2_memory.history.held_values import (
@@ -125,7 +125,7 @@ def count_matches(
     condition = condition_of(view, topic, condition_type, tested, field=field, min_score=min_score)
     asked = clamped(view, window)
     if by == BY_LABEL:
-        window = reached(view.snapshot, asked)
+        window = shown_window(view.snapshot, asked)
         require_recorded(view, asked if window.empty else window)
         scope = Scope(view, window, where, during)
         return count_labels(view, topic, condition, scope, any_label=any_label, asked=asked)
@@ -477,7 +477,7 @@ def count_values(
         held_values = values.known[::-1]
         if not held_values:
             raise
-        start = values.reached
+        start = values.complete_since
         view.notes.add_lack(f"only what is after {unix_text(start)} is counted: {error}")
     if not held_values:
         raise no_data_between(view, (topic,), asked)

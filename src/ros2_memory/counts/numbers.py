@@ -177,7 +177,11 @@ class PieceNumbers:
         """
         try:
             for rows in scan(
-                self._view, self._topic, window, newest_first=True, reached=self._add_newer_than
+                self._view,
+                self._topic,
+                window,
+                newest_first=True,
+                before_table=self._add_newer_than,
             ):
                 self._pending.append(rows)
         except QueryTimeoutError:

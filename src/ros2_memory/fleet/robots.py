@@ -146,7 +146,7 @@ class Robot:
 def _reaches_back(own: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     """Returns whether a robot's own bags begin before the time that a question is about."""
     snapshot = own.index.snapshot()
-    begin = since(own.now(own.clock.now(), snapshot.latest))
+    begin = since(own.now(snapshot.latest))
     return begin is None or (snapshot.earliest is not None and begin >= snapshot.earliest)
 
 

@@ -201,13 +201,13 @@ class Memory:
             return None
         return heartbeat
 
-    def now(self, wall: Ns, latest: Ns | None, call: Call | None = None) -> Ns:
+    def now(self, latest: Ns | None, call: Call | None = None) -> Ns:
         """Returns the time that ages count from: the wall clock's, or the newest recorded one.
 
         A `call` whose answer has ages remembers the latter.
         """
         if self.limits.now == "wall" or latest is None:
-            return wall
+            return self.clock.now()
         if call is not None:
             call.now = latest
         return latest
@@ -355,7 +355,7 @@ class Latching:
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
-    def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
+    def may_latch(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
         return self._without_pace(snapshot, topic) is not False
 

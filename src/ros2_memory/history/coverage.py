@@ -602,14 +602,14 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     does not count, unless the whole window is later. With an open end (`MAX_NS`), nor does time
     after the memory.
     """
-    snapshot, memory = view.snapshot, view.memory
+    snapshot = view.snapshot
     reach = recorded_reach(snapshot, asked)
     if reach is None:
         return
     first, last = reach
     start, end = asked.asked()
     start = max(start, min(0, first))
-    until = last if asked.stop >= MAX_NS else memory.now(memory.clock.now(), snapshot.latest)
+    until = last if asked.stop >= MAX_NS else view.memory.now(snapshot.latest)
     if start < until:
         end = min(end, until)
     counted_window = TimeWindow(start, end)
@@ -663,7 +663,7 @@ def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:
     return max(start, first), min(end, last)
 
 
-def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
+def shown_window(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show; see `recorded_reach`."""
     first, last = recorded_reach(snapshot, window) or (window.start, window.stop - 1)
     return window.intersect(TimeWindow(first, last + 1))

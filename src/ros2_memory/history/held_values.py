@@ -108,7 +108,7 @@ class HeldValues:
         until: the end of the time that is asked about: later messages may have another type.
 
     Attributes:
-        reached: `back` has yielded all values that began at this log time or later.
+        complete_since: `back` has yielded all values that began at this log time or later.
         known: the values that `during` has found, newest first, also if time was over.
 
     Raises:
@@ -131,7 +131,7 @@ class HeldValues:
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
         self._breaks = breaks_of(view, topic)
         self._reading = view.call.partial_after(READING_S)
-        self.reached: Ns = MAX_NS
+        self.complete_since: Ns = MAX_NS
         self.known: list[HeldValue] = []
         self._require_single_value(asked, until)
 
@@ -185,7 +185,7 @@ class HeldValues:
         Raises:
             QueryTimeoutError: while it is iterated, when the time for reading is over.
         """
-        self.reached = until
+        self.complete_since = until
         later = self._runs(TimeWindow(until, MAX_NS), newest_first=False)
         following = next(later, None)
         for earlier in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
@@ -194,7 +194,7 @@ class HeldValues:
                 # Only the newest run can go on after `until`.
                 run, following = run._replace(last=following.last), next(later, None)
             stop, ended = self._end_of(run, following)
-            self.reached = run.first
+            self.complete_since = run.first
             yield HeldValue(run.word, run.first, stop, ended)
             following = run
 
@@ -209,7 +209,7 @@ class HeldValues:
         for held in self.back(stop):
             chars += len(held.word)
             if chars > _MOST_CHARS:
-                self.reached = self.known[-1].start if self.known else stop
+                self.complete_since = self.known[-1].start if self.known else stop
                 raise QueryTimeoutError(f"the values take more than {_MOST_CHARS:,} characters")
             if held.stop > start or held.start >= start - START_SLACK_NS:
                 self.known.append(held)
@@ -246,7 +246,7 @@ class HeldValues:
     def _runs_of_blocks(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
         """Yields the runs of each block of rows: a run may go on in the next block."""
         scanned = scan(
-            self._view, self._topic, window, newest_first=newest_first, reached=self._check
+            self._view, self._topic, window, newest_first=newest_first, before_table=self._check
         )
         for block in blocks(scanned, newest_first=newest_first):
             columns: list[tuple[IntArray, Texts]] = []
@@ -556,10 +556,10 @@ def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans
     first = min((first for first, _ in chain.from_iterable(recordings)), default=MAX_NS)
     breaks = sorted(chain.from_iterable(ends_of_holding(view, topic) for topic in topics))
     unknown: Spans = []
-    reached = MIN_NS
+    known_again = MIN_NS
     for at in breaks[max(bisect_right(breaks, window.start) - 1, 0) :]:
-        if reached <= at < window.stop:
+        if known_again <= at < window.stop:
             message = view.stream.first([*topics], TimeWindow(at + 1, window.stop))
-            reached = MAX_NS if message is None else message.time
-            unknown.append((at, reached))
+            known_again = MAX_NS if message is None else message.time
+            unknown.append((at, known_again))
     return without([(first, MAX_NS)], unknown)

@@ -48,7 +48,7 @@ _DEFAULT_POSES: Final = "/odom"
 """The default of `data.pose_topic`."""
 _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
 """Matches names of topics whose poses are not the robot's."""
-MOST_TRIED: Final = 20
+_MOST_TRIED: Final = 20
 """At most this many topics of unmapped types are looked into for poses."""
 _BEST_POSES: Final = {
     "position": " (best to odometry that no localisation corrects)",
@@ -59,7 +59,7 @@ _NEAR_NS: Final = 60 * NS_PER_S
 """A message that is older by no more may stand in for a missing one."""
 _CLOCKS_DIFFER_NS: Final = 60 * NS_PER_S
 """A time that is later than now by no more may be now by the clock of the client."""
-ON_DISK_S: Final = 3
+_ON_DISK_S: Final = 3
 """A received message is on disk after this time: the recorder's chunks are small."""
 
 
@@ -200,7 +200,7 @@ def unmapped_topics_with(view: View, what: str = "position") -> list[str]:
     """Returns topics of types outside the schema map whose newest message has a pose.
 
     Or, if `what` is "geodetic", latitude and longitude. Each is followed by its type. At most
-    `MOST_TRIED` topics are read.
+    `_MOST_TRIED` topics are read.
     """
     extractor, timeline = view.extractor, view.timeline
     unmapped = [
@@ -209,13 +209,13 @@ def unmapped_topics_with(view: View, what: str = "position") -> list[str]:
         if not any(extractor.is_mapped(type_name) for type_name in timeline.types_of(topic))
     ]
     topics = []
-    for topic in unmapped[:MOST_TRIED]:
+    for topic in unmapped[:_MOST_TRIED]:
         # A message cannot be decoded, or a lake does not hold it, as an image.
         with suppress(NoDataError, NotInLakeError):
             newest = view.stream.last(topic)
             if newest is None:
                 continue
-            message, type_name = decode(view, newest), newest.type
+            message, type_name = require_decoded(view, newest), newest.type
             if what == "geodetic":
                 has_it = extractor.geodetic(message, type_name) is not None
             else:
@@ -294,7 +294,7 @@ def require_bags(view: View) -> None:
     if snapshot.active:
         lack, after_s = nothing_here(snapshot), view.limits.closed_after_s
         if _active_answers(view):
-            lack, after_s = "nothing of the first split is on disk yet", ON_DISK_S
+            lack, after_s = "nothing of the first split is on disk yet", _ON_DISK_S
         raise NoDataError(NoDataReason.NOT_CLOSED_YET, f"{lack}; ask again in {after_s:g} s")
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
@@ -559,7 +559,7 @@ def undecodable(error: UndecodableError) -> NoDataError:
     )
 
 
-def decode(view: View, stored: StoredMessage) -> object:
+def require_decoded(view: View, stored: StoredMessage) -> object:
     """Returns the decoded message.
 
     Raises:
@@ -614,7 +614,7 @@ def _advice(view: View, reason: NoDataReason, at: Ns, topics: Sequence[str] = ()
             "an earlier moment"
         )
     elif reason is NoDataReason.NOT_CLOSED_YET and _active_answers(view):
-        yield f"ask about an earlier moment, or again in {ON_DISK_S} s"
+        yield f"ask about an earlier moment, or again in {_ON_DISK_S} s"
     elif reason is NoDataReason.NOT_CLOSED_YET:
         yield (
             "the split being written is not read until it closes: ask about an earlier moment, "

@@ -90,7 +90,7 @@ class CandidateRows:
             yield from self._view.stream.messages(topics, window, newest_first=True)
 
     @property
-    def reached(self) -> Ns:
+    def searched_to(self) -> Ns:
         """The log time from which on all messages were searched."""
         unread = [time + 1 for time, _ in self._group[:1]]
         return max([*self._scanned_to.values(), *unread], default=MIN_NS)
@@ -134,7 +134,7 @@ class CandidateRows:
             newest_first=True,
             may_match=self._may_match,
             may_be_empty=True,
-            reached=note_progress,
+            before_table=note_progress,
         ):
             yield from pending_after(rows.last)
             pending = pending[: np.searchsorted(pending, rows.last, "right")]
@@ -225,7 +225,7 @@ class ReverseSearch:
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
-            raise out_of_time(self._view, candidates.reached) from error
+            raise out_of_time(self._view, candidates.searched_to) from error
         self.close(window, is_found=False, ruled_out=candidates.ruled_out)
         return None
 

@@ -48,7 +48,7 @@ def scan(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     for rows in open_scan(view, topic, window, **how).rows(newest_first=newest_first):
-        view.note_thinned(TimeWindow(rows.first, rows.last + 1))
+        view.track_thinned(TimeWindow(rows.first, rows.last + 1))
         yield rows
 
 
@@ -68,7 +68,7 @@ class How(Wanted, total=False):
 
     columns: bool
     copies: bool
-    reached: Callable[[Ns], None]
+    before_table: Callable[[Ns], None]
 
 
 def open_scan(
@@ -78,7 +78,7 @@ def open_scan(
     *,
     columns: bool = True,
     copies: bool = False,
-    reached: Callable[[Ns], None] = lambda _: None,
+    before_table: Callable[[Ns], None] = lambda _: None,
     **wanted: Unpack[Wanted],
 ) -> Scan:
     """Returns the scan of a topic in a window; notes report what cannot be read.
@@ -90,8 +90,8 @@ def open_scan(
         columns: whether rows have more than times. Without columns, messages that cannot be decoded
             have rows, too.
         copies: whether a message counts in each recording that holds it.
-        reached: called before each table, with a log time. Rows that are left are not earlier; with
-            `newest_first`, not later.
+        before_table: called before each table, with a log time. Rows that are left are not
+            earlier; with `newest_first`, not later.
         **wanted: options of `Scan`.
     """
 
@@ -99,7 +99,7 @@ def open_scan(
         return view.bags.tables(bag, topic, window, hashed=hashed, columns=columns, around=True)
 
     def check(at: Ns) -> None:
-        reached(at)
+        before_table(at)
         view.bags.check_deadline()
 
     wanted.setdefault("shared", () if copies else view.timeline.shared_times)
@@ -140,7 +140,7 @@ def joined_back(
         beside: how far (ns) before and after a stretch its results depend on rows.
     """
     for stretch in opened.stretches(beside):
-        view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
+        view.track_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
         key = key_of(stretch)
         if key is None:
             yield from make(stretch._replace(parts=None))

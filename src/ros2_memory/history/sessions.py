@@ -21,7 +21,7 @@ from weakref import proxy
 
 import numpy as np
 
-from ros2_memory.analysis.frames import is_edge
+from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.columns.fragments import FragmentKey
@@ -57,8 +57,6 @@ if TYPE_CHECKING:
 Session: TypeAlias = frozenset[str]
 """The folders of its recordings, by their names when they were recorded."""
 
-_AROUND_NS: Final = 10 * NS_PER_S
-"""A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 _BETWEEN_THINNED_NS: Final[Ns] = NS_PER_S
 _FEW_SESSIONS: Final = 4
 """After this many sessions, the static transforms of all are looked up at once."""
@@ -188,7 +186,7 @@ class Sessions:
         """Returns the sessions whose transforms hold at a moment; None if nothing was recorded.
 
         In two groups, of which the first that has an answer counts: the sessions that went on then,
-        and those that ended or began within `_AROUND_NS` of it. In the latter, ended sessions come
+        and those that ended or began within `TF_CACHE_NS` of it. In the latter, ended sessions come
         before those that had not begun, and the nearest come first.
         """
         around = self._around(moment)
@@ -248,7 +246,7 @@ class Sessions:
         near = [
             (folder, span)
             for folder, span in self._spans.poses
-            if _distance(span, at) <= _AROUND_NS
+            if _distance(span, at) <= TF_CACHE_NS
         ]
         for (folder, (first, last)), (other, (begin, end)) in combinations(near, 2):
             overlap = max(first, begin) <= min(last, end)
@@ -281,12 +279,12 @@ class Sessions:
         return around
 
     def _folders_around(self, moment: Ns) -> dict[str, Span]:
-        """Returns the recordings with bags within `_AROUND_NS` of a moment, by folder.
+        """Returns the recordings with bags within `TF_CACHE_NS` of a moment, by folder.
 
         With the first and last log time in these bags.
         """
         spans: dict[str, Span] = {}
-        for bag in self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS)):
+        for bag in self._view.timeline.overlapping(TimeWindow.around(moment, TF_CACHE_NS)):
             folder = self.folder(bag.recording)
             spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
         spans.pop(self._carried, None)

@@ -230,20 +230,20 @@ class MatchTester:
         return self._numbers[topic]
 
 
-def _merged_and_split(waiting: Block, reached: Block) -> tuple[Block | None, Block]:
-    """Returns two overlapping blocks as one after the end of `reached`, and one up to its end.
+def _merged_and_split(waiting: Block, following: Block) -> tuple[Block | None, Block]:
+    """Returns two overlapping blocks as one after the end of `following`, and one up to its end.
 
     No block that a scan reaches later has messages after that end. The first block is None if it
     has no message.
     """
     if not waiting.tested().times.size:
-        return None, reached
-    if not reached.tested().times.size:
+        return None, following
+    if not following.tested().times.size:
         return None, waiting
     # In one recording, what the scan reaches later was written before.
-    both = stacked([reached.tested(), waiting.tested()])
+    both = stacked([following.tested(), waiting.tested()])
     ordered = rows_of(both, np.lexsort((both.sources, both.times)))
-    cut = int(np.searchsorted(ordered.times, reached.last, side="right"))
+    cut = int(np.searchsorted(ordered.times, following.last, side="right"))
     older = _block_of(waiting.topic, rows_of(ordered, slice(cut)))
     newer = rows_of(ordered, slice(cut, None))
     return (_block_of(waiting.topic, newer) if newer.times.size else None), older

@@ -30,7 +30,14 @@ from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    NS_PER_HOUR,
+    NS_PER_MS,
+    NS_PER_S,
+    Ns,
+)
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.no_data import no_data_at, not_recorded, reason_between, reason_beyond
@@ -49,8 +56,6 @@ if TYPE_CHECKING:
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read, until they lead to the frame."""
 
-_LONGER_NS: Final = 3600 * NS_PER_S
-"""How far around the moment a frame is searched that is unknown then."""
 _BORROWED: Final = Reason(
     "is placed by transforms of another recording of the same time; no handover proves that both "
     "are of one robot",
@@ -69,12 +74,12 @@ class FoundTransform(NamedTuple):
     Attributes:
         transform: the transform.
         clock: the clock in which the moment was meant.
-        reach: how far around the moment (ns) transforms were read.
+        around: how far around the moment (ns) transforms were read.
     """
 
     transform: Transform
     clock: TfClock
-    reach: Ns
+    around: Ns
 
 
 def transform_at(
@@ -108,7 +113,7 @@ def transform_at(
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), view.sessions
     if recording is not None:
-        session = lending_to(view, recording, frames, at)
+        session = session_placing(view, recording, frames, at)
         return _transform_of_session(view, session, frames, at, explains=explains)
     groups = sessions.recorded_at(at)
     if groups is None:
@@ -151,7 +156,7 @@ def _note_sessions(
         )
 
 
-def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
+def session_placing(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
     """Returns the session whose transforms place a message of a recording.
 
     That is the recording's own session, or, with a note, the session joined with its lender, if
@@ -226,7 +231,7 @@ def _explain_failure(
 ) -> NoDataError:
     """Explains the failure of a lookup near a moment by the whole memory.
 
-    A frame that is unknown near the moment, but known within `_LONGER_NS` of it, is a gap.
+    A frame that is unknown near the moment, but known within an hour of it, is a gap.
     """
     topics, near = view.moving_topics, TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
@@ -249,7 +254,7 @@ def _explain_failure(
 def _nearest_connection(view: View, frames: tuple[str, str], at: Ns, session: Session) -> Ns | None:
     """Returns when transforms next to a moment lead from one frame to the other, to 0.1 s.
 
-    None if there are none within `_LONGER_NS`.
+    None if there are none within an hour.
     """
 
     def leads_until(other: Ns) -> bool:
@@ -258,9 +263,9 @@ def _nearest_connection(view: View, frames: tuple[str, str], at: Ns, session: Se
 
     moments: list[Ns] = []
     for direction in (-1, 1):
-        if not leads_until(at + direction * _LONGER_NS):
+        if not leads_until(at + direction * NS_PER_HOUR):
             continue
-        near, far = 0, _LONGER_NS
+        near, far = 0, NS_PER_HOUR
         while far - near > NS_PER_S // 10:
             middle = (near + far) // 2
             near, far = (near, middle) if leads_until(at + direction * middle) else (middle, far)

@@ -148,7 +148,7 @@ class View:
         firsts = concatenated(column.firsts for column in columns)
         return firsts, concatenated(column.lasts for column in columns)
 
-    def note_thinned(self, window: TimeWindow) -> None:
+    def track_thinned(self, window: TimeWindow) -> None:
         """Records for the reply if a window that was read lies partly in thinned days."""
         if not self.timeline.thinned:
             return
@@ -204,7 +204,7 @@ class View:
         """Returns the log time of the newest message of a type that is no copy."""
         for block in blocks(opened.rows(newest_first=True), newest_first=True):
             for rows in block:
-                self.note_thinned(TimeWindow(rows.first, rows.last + 1))
+                self.track_thinned(TimeWindow(rows.first, rows.last + 1))
             spans = [rows.span for rows in block if rows.table.channel.type == type_name]
             if spans:
                 return max(last for _, last in spans)
@@ -387,7 +387,7 @@ def open_search(memory: Memory, call: Call, span: TimeRange) -> tuple[View, Ns, 
     """
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    now = memory.now(wall, view.snapshot.latest, call)
+    now = memory.now(view.snapshot.latest, call)
     return view, now, search_window(span, now)
 
 
@@ -395,4 +395,4 @@ def _open_now(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
     """Returns the view for a moment before now, and now."""
     wall = memory.clock.now()
     view = open_view(memory, call, None if memory.limits.now == "latest" else wall - ago)
-    return view, memory.now(wall, view.snapshot.latest, call)
+    return view, memory.now(view.snapshot.latest, call)

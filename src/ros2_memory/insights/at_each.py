@@ -79,7 +79,7 @@ def in_each(
         raise InvalidArgumentsError("between cannot be combined with around: one moment is asked")
     wall = memory.clock.now()
     snapshot = memory.snapshot(min(search_window(span, wall).stop, wall))
-    whole = search_window(span, memory.now(wall, snapshot.latest, call))
+    whole = search_window(span, memory.now(snapshot.latest, call))
     start, end = whole.asked()
     first, last = recorded_reach(snapshot, whole) or (0, -1)
     # A window up to midnight has nothing of the next day.

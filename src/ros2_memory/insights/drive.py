@@ -39,7 +39,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.clock_steps import elapsed_in
-from ros2_memory.history.coverage import reached, recording_gaps
+from ros2_memory.history.coverage import recording_gaps, shown_window
 from ros2_memory.history.driven_path import (
     PoseSlice,
     driven_path,
@@ -158,7 +158,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown")
         return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
-    known = reached(view.snapshot, TimeWindow(begin, window.stop))
+    known = shown_window(view.snapshot, TimeWindow(begin, window.stop))
     spans = without([known.asked()], [*recording_gaps(view, known)])
     recorded = elapsed.among(spans)
     return Drive(elapsed, path, trajectory, standstills, drops, recorded)

@@ -124,11 +124,11 @@ def find_episodes(
                 since = episodes[limit - 1].first
                 break
     except QueryTimeoutError as error:
-        if values.reached >= scope.window.stop:
+        if values.complete_since >= scope.window.stop:
             raise
         if not episodes:
-            raise out_of_time(view, values.reached) from error
-        since = values.reached
+            raise out_of_time(view, values.complete_since) from error
+        since = values.complete_since
         view.notes.add_lack(
             f"the search ran out of time at {unix_text(since)}: to continue, pass that time as end"
         )
@@ -253,7 +253,7 @@ def topic_changes(
         if not held:
             raise
         view.notes.add_lack(
-            f"only what is after {unix_text(values.reached)} is listed: {error}; to see the "
+            f"only what is after {unix_text(values.complete_since)} is listed: {error}; to see the "
             "rest, ask again with that as end"
         )
     if not held:

@@ -195,7 +195,7 @@ def recap(
     answer = Recap(
         start=start,
         end=end,
-        now=memory.now(memory.clock.now(), view.snapshot.latest, view.call),
+        now=memory.now(view.snapshot.latest, view.call),
         distance_m=None,
         max_speed=None,
         stood=_standing_time(view, drive, end - start),

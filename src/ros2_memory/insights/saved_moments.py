@@ -176,7 +176,7 @@ def _now(memory: Memory, call: Call) -> Ns:
     latest = None
     if memory.limits.now == "latest":
         latest = View(memory, call, wall).snapshot.latest
-    return memory.now(wall, latest, call)
+    return memory.now(latest, call)
 
 
 def _require_recorder(memory: Memory) -> None:

@@ -70,7 +70,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     view.bags.track_all_sources()
     snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
-    now = memory.now(wall, latest, call)
+    now = memory.now(latest, call)
     live = heartbeat is not None and heartbeat.is_live(wall)
     heard = _last_heard(snapshot) if live else latest
     recorder = ANOTHER if any(bag.growing for bag in snapshot.active) else None

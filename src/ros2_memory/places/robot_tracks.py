@@ -60,7 +60,7 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.history.transforms import edges_of_rows, frames_over, lending_to
+from ros2_memory.history.transforms import edges_of_rows, frames_over, session_placing
 from ros2_memory.places.stays import KnownTrack
 
 if TYPE_CHECKING:
@@ -376,7 +376,7 @@ class TrackReader:
 
         A note says if it is not the recording's own, or if there is none.
         """
-        session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
+        session = session_placing(self._view, recording, (self._frame_id, self._own_frame), at)
         if not session:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session

@@ -203,7 +203,7 @@ def span_shown(
     # If a recorder runs, a time past the newest bag makes the index scan the folder.
     snapshot = memory.index.snapshot(memory.clock.now() if memory.limits.now == "wall" else None)
     version = _version(snapshot, filling, 0 if questions is None else questions.count)
-    now = moment(memory.now(memory.clock.now(), snapshot.latest))
+    now = moment(memory.now(snapshot.latest))
     if version == request.version:
         return {"version": version, "unchanged": True, "now": now}
     earliest, latest = snapshot.dating.earliest, snapshot.dating.latest
