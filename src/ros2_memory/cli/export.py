@@ -18,7 +18,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import counted, match_topics
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
@@ -108,15 +108,20 @@ class Exported(NamedTuple):
 def _matching_topics(view: View, globs: Sequence[str]) -> list[str]:
     """Returns the recorded topics that match one of the globs; all topics if there are no globs.
 
+    A note names globs that match none.
+
     Raises:
         NoDataError: nothing is recorded, or no topic matches.
     """
     require_bags(view)
     names = view.timeline.topics()
     chosen = {name for glob in globs or ("*",) for name in match_topics(names, glob)}
+    missing = [glob for glob in globs if not match_topics(names, glob)]
+    not_recorded = f"no recorded topic matches {listed(missing)}; list_recorded_topics has them"
     if not chosen:
-        asked = f"no recorded topic matches {', '.join(globs)}; list_recorded_topics has them"
-        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, asked)
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, not_recorded)
+    if missing:
+        view.notes.add(not_recorded)
     return sorted(chosen)
 
 

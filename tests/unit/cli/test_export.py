@@ -115,6 +115,15 @@ def test_the_profile_is_that_of_ros_2_where_the_first_message_is_cdr(tmp_path: P
     assert len(read(ours)) == 100
 
 
+def test_a_topic_that_was_never_recorded_is_noted(
+    bag_dir: Path, exits: Program, tmp_path: Path
+) -> None:
+    write_mcap(bag_dir / "rec_0.mcap", driven(T0 + 1, 0))
+    topics = "--topic /odom --topic /odmo"
+    noted = exits(0, f"export --mcap {tmp_path}/out.mcap {topics} {bag_dir}").err
+    assert "no recorded topic matches /odmo" in noted
+
+
 def require_the_same(folder: Path, out: Path) -> None:
     """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
     reader = Rosbag2Reader()

@@ -246,6 +246,16 @@ def test_answers_say_that_messages_were_deleted(
     assert "every message of /mic was deleted" in every["detail"]
 
 
+def test_a_topic_that_was_never_recorded_is_named_before_others_go(
+    bag_dir: Path, forget: Forget
+) -> None:
+    shown = forget(0, 0, 30, f"--dry-run --topic {MIC} --topic '/camra/*'").out
+    assert "no recorded topic is named /camra/*\n" in shown
+    assert f"{MIC}: 30 messages" in shown
+    refused = forget(2, 0, 30, "--yes --topic /a --topic /b").err
+    assert "no recorded topic is named /a, /b" in refused
+
+
 def test_carried_messages_follow_where_their_topic_is_named_unless_a_recorder_has_them(
     bag_dir: Path, forget: Forget
 ) -> None:

@@ -188,9 +188,13 @@ class _Forget:
             recorded = self._eraser.topics()
         latched = recorded.intersection(self._carrier.topics(self._memory.index.snapshot()))
         if globs:
+            missing = [glob for glob in globs if not match_topics(recorded, glob)]
+            not_recorded = f"no recorded topic is named {listed(missing)}"
+            if len(missing) == len(globs):
+                raise InvalidArgumentsError(not_recorded)
+            if missing:
+                print_line(not_recorded)
             topics = {name for glob in globs for name in match_topics(recorded, glob)}
-            if not topics:
-                raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
         else:
             topics = {*recorded} - latched
             if latched and windows:
