@@ -200,13 +200,14 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     detections, labels = _detections(seen, slices)
     group, together = _label_groups(detections)
     rows = np.flatnonzero(detections.is_placed)
-    rows = rows[stable_order(group[rows])]
-    cluster = np.full(len(detections.message), -1, np.int64)
+    floor, cluster = np.full((2, len(detections.message)), -1, np.int64)
+    floor[rows] = _floors(group[rows], detections.z[rows])
+    rows = rows[stable_order(floor[rows])]
     cluster[rows] = _clusters(
-        group[rows], detections.message[rows], detections.x[rows], detections.y[rows]
+        floor[rows], detections.message[rows], detections.x[rows], detections.y[rows]
     )
     in_spot = cluster >= 0
-    _, spot = distinct_rows((group[in_spot], cluster[in_spot]))
+    _, spot = distinct_rows((floor[in_spot], cluster[in_spot]))
     placed = rows_of(detections, in_spot)
     is_scored = ~np.isnan(placed.score)
     row, other_label = _labels_beside(placed)
@@ -312,12 +313,23 @@ def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
     return group, together
 
 
+def _floors(group: Ints, z: Ints) -> Ints:
+    """Returns a number for the detections of a group that are on one floor, ascending by group."""
+    order = np.lexsort((z, group))
+    is_other = np.diff(group[order], prepend=-1) > 0
+    is_other |= np.diff(z[order], prepend=0) > STOREY_MM
+    floors = np.empty(len(group), np.int64)
+    floors[order] = np.cumsum(is_other)
+    return floors
+
+
 def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
     """Returns the spot of each detection within its group; -1 for detections of too many spots.
 
-    Detections are ordered by group and by message. Each goes to the nearest spot, no two of a
-    message to one. Mostly a group is one spot, as each of its detections lies near the mean of
-    those before: only the other groups are clustered one by one.
+    A group has one label in one slice on one floor. Detections are ordered by group and by message.
+    Each goes to the nearest spot, no two of a message to one. Mostly a group is one spot, as each
+    of its detections lies near the mean of those before: only the other groups are clustered one
+    by one.
     """
     begins = run_starts(group)
     start = np.repeat(begins, np.diff(begins, append=len(group)))

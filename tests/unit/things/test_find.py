@@ -375,6 +375,22 @@ def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[See
         assert since["mug"] == {"seen_since": last}
 
 
+def test_two_of_a_kind_one_above_the_other_are_two_though_no_message_has_both(
+    tmp_path: Path,
+) -> None:
+    """As from open stairs, on which a robot passes both within seconds."""
+    messages: list[Msg] = []
+    for second in range(60):
+        *robot, _ = scene(second, (0.0, 0.0, 0.0), [], in_map=False)
+        height = 4.9 if second % 10 > 4 else 0.7
+        messages += [*robot, detected((BEGIN + second) * S, [("cup", 0.9, (2.0, 0.0, height))])]
+    things = told_of(tmp_path, messages, label="cup")["things"]
+    assert sorted((thing["place"]["z"], thing["count"]) for thing in things) == [
+        (0.7, 30),
+        (4.9, 30),
+    ]
+
+
 def test_what_is_on_another_floor_is_not_near_a_thing(tmp_path: Path) -> None:
     seen = [("cup", 0.9, (2.0, 0.0, 0.7)), ("book", 0.9, (2.3, 0.0, 1.4))]
     above = [("lamp", 0.9, (2.2, 0.0, 4.9)), ("cup", 0.9, (2.0, 0.0, 4.9))]
