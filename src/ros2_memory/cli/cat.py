@@ -23,6 +23,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.no_data import resolve_topic
+from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.messages.levels import with_level_names
@@ -84,6 +85,7 @@ def cat(
         )
     count = print_exactly(lines)
     note_unread(view, window)
+    note_times_twice(view, window)
     print_notes(view.notes.sentences())
     if not count:
         advice = "`ros2-memory topics` says when there are some"

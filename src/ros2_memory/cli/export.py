@@ -23,6 +23,7 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Channel, Record
@@ -66,6 +67,7 @@ def export(
     window = times.window(memory)
     topics = _matching_topics(view, topic or ())
     note_unread(view, window)
+    note_times_twice(view, window)
     earlier: list[StoredMessage] = []
     # Where nothing is recorded, they alone would look like an answer.
     if mcap is not None and latched and view.timeline.overlapping(window):

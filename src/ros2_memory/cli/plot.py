@@ -30,6 +30,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, Span, ns_from_unix, unix_fro
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import note_unread, recording_gaps, shown_window
 from ros2_memory.history.no_data import resolve_topic
+from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View, open_view
 from ros2_memory.insights.recap import recap
@@ -152,6 +153,7 @@ def plot_path(*, picture: Picture) -> None:
     with spinner("looking for the path"):
         frame, line = _path_in(shown)
         note_unread(shown.view, shown.window)
+        note_times_twice(shown.view, shown.window)
     with picture.figure("Path", shown, [*shown.view.notes.sentences()]) as figure:
         _draw_path(figure.add_subplot(), shown, frame, line)
 

@@ -362,6 +362,12 @@ def _parallel_recordings(
     return None
 
 
+def note_times_twice(view: View, window: TimeWindow) -> None:
+    """Notes which recordings have a time of a window twice, for what has the messages of both."""
+    for pair in _times_recorded_twice(view, window):
+        view.notes.add(f"{pair.describe_by_clock('')}: both are here, mixed in the order of time")
+
+
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
     """Does `note_robots` for the first few topics; returns the times of all."""
     spans_by_topic = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]

@@ -105,6 +105,25 @@ def test_where_nothing_is_recorded_latched_messages_of_before_are_no_export(
     assert not out.exists()
 
 
+def test_of_a_time_that_a_file_has_twice_each_command_says_that_both_are_mixed(
+    tmp_path: Path, exits: Program
+) -> None:
+    """As of a simulation that was reset while its clock gave the log times."""
+    poses = [odom(T0 + n * NS_PER_S, n / 2) for n in range(60)]
+    write_mcap(tmp_path / "bags" / "run" / "run_0.mcap", [*poses, *poses[:40]])
+    bags = tmp_path / "bags"
+    for command in (
+        f"export --mcap {tmp_path}/copy.mcap {bags}",
+        f"cat /odom {bags} --tail 1",
+        f"plot path {bags} --out {tmp_path}/x.svg",
+    ):
+        said = exits(0, command)
+        note = (
+            "twice, as the clock was set back meanwhile: both are here, mixed in the order of time"
+        )
+        assert note in said.out + said.err, command
+
+
 def test_the_profile_is_that_of_ros_2_where_the_first_message_is_cdr(tmp_path: Path) -> None:
     folder = tmp_path / "bags"
     raw_mcap(folder / "json_0.mcap", things)
