@@ -263,6 +263,9 @@ def check_clock(robot: Examined) -> Iterator[Finding]:
         yield error(f"the newest data is dated {ahead_s:.0f} s after the present", do)
     elif dating.faults:
         faults = counted(len(dating.faults), "bag was", "bags were")
+        # Where no bag has a later date, the time is that of a simulation, which was reset.
+        if dating.latest is not None and dating.latest < FIRST_BAGS_NS:
+            do = "record each run of a simulation in a recording of its own"
         yield warning(f"{faults} dated by a wrong clock: `ros2-memory info` lists them", do)
     else:
         yield ok(f"{iso_local(now)} (this machine)")

@@ -113,6 +113,15 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
     assert f"MEMORY_CONFIG_DIR={beside}" in output
 
 
+def test_a_simulation_that_was_reset_needs_no_other_clock(
+    tmp_path: Path, examined: Examined
+) -> None:
+    run = [odom(n * NS_PER_S, n / 10, 0.0) for n in range(60)]
+    write_mcap(tmp_path / "run" / "run_0.mcap", [*run, *run[:40]])
+    [clock] = examined(1, str(tmp_path))["clock"]
+    assert clock["do"] == "record each run of a simulation in a recording of its own"
+
+
 def test_data_from_the_future_means_that_the_clock_is_wrong(
     robot: Path, examined: Examined
 ) -> None:
