@@ -100,7 +100,7 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.fields import extremes_of
-from ros2_memory.insights.silences import describe_silences, silences_of
+from ros2_memory.insights.silences import describe_unsearched, silences_of
 from ros2_memory.insights.status import (
     bags_with_remarks,
     clock_faults,
@@ -889,7 +889,7 @@ def _notes_on_never(view: View, search: _Search, reverse_search: ReverseSearch) 
     notes = (
         *not_covered(view, topics, window),
         *describe_gaps(view, window, explained=True),
-        *describe_silences(view, topics, window),
+        *describe_unsearched(view, topics, window),
         *notes_on_never(view, search.topic, condition, window, search.min_score),
     )
     if notes or _may_be_elsewhere(view, topics, condition):

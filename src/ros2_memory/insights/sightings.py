@@ -48,7 +48,7 @@ from ros2_memory.insights.episodes import (
     with_robot,
 )
 from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs
-from ros2_memory.insights.silences import describe_silences
+from ros2_memory.insights.silences import describe_unsearched
 from ros2_memory.insights.topic_events import GoalRun, goals_matching
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at, with_place
@@ -125,7 +125,7 @@ def find_matches(
     note_robots_on(view, topics, found.searched)
     note_unread(view, found.searched, nothing=is_never, search=True)
     if is_never:
-        view.notes.add(*describe_silences(view, topics, found.searched))
+        view.notes.add(*describe_unsearched(view, topics, found.searched))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import defaultdict
 from functools import cache, partial
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import Silence
@@ -100,6 +101,16 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[Span]:
     silences = [silence for silence in silences_in(view, window) if silence.topic == topic]
     silent = [(silence.start, silence.end) for silence in silences]
     return united([*recording_gaps(view, window), *silent])
+
+
+def describe_unsearched(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:
+    """Returns a sentence if topics were first heard after a window; else their silences in it."""
+    spans = chain.from_iterable(view.timeline.recordings(topic).values() for topic in topics)
+    first_heard = min((first for first, _ in spans), default=MIN_NS)
+    if first_heard < window.stop or view.snapshot.older is not None:
+        return describe_silences(view, topics, window)
+    named = listed([*topics])
+    return (f"no message of {named} is here before {unix_text(first_heard)}: nothing was searched",)
 
 
 def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:

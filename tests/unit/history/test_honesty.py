@@ -394,6 +394,23 @@ def test_what_a_topic_reports_that_was_not_recorded_in_a_time_is_unknown_then_no
 NO_MEMORY: Final = memory_of(Path("/nowhere"))
 
 
+@each_way
+def test_a_search_before_the_first_message_of_its_topics_says_that_nothing_was_searched(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The robot is recorded for a minute, its bumper from 30 s on: it says something twice."""
+    made = [odom(T0 + n * S, 0.0) for n in range(60)]
+    made += [boolean(T0 + n * S, n == 50) for n in (30, 50)]
+    bags.write_splits(tmp_path, made)
+    memory = memory_of(tmp_path, recalls=recalls)
+    hit = {"topic": "/bump*", "condition_type": "equals", "value": True}
+    unsearched = f"no message of /bumper is here before {T0_S + 30}.000000: nothing was searched"
+    assert asked(memory, "find_matches", **hit, end=T0_S + 20)["notes"] == [unsearched]
+    assert asked(memory, "find_last_match", **hit, before=T0_S + 20)["notes"] == [unsearched]
+    assert "notes" not in asked(memory, "find_matches", **hit, start=T0_S + 35, end=T0_S + 40)
+    assert asked(memory, "find_last_match", **hit, before=T0_S + 40) is None
+
+
 def listed(number: int, notes: tuple[str, ...] = ()) -> BagFile:
     start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
     return odom_bag(f"/b/rec/rec_{number}.mcap", start, end, written=end, notes=notes)
