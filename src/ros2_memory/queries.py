@@ -67,6 +67,7 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
 from ros2_memory.history.no_data import (
     accepting,
+    describe_earlier_poses,
     describe_lack,
     no_data_at,
     no_data_between,
@@ -285,7 +286,11 @@ def position(
             frame_id=frame_id,
         )
     _require_kind(view, name, "position", "geodetic")
-    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    try:
+        stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    except NoDataError as error:
+        detail = error.detail + describe_earlier_poses(view, name, at + 1)
+        raise NoDataError(error.reason, detail, error.notes) from error
     _note_latched(view, stored, at)
     message = require_decoded(view, stored)
     pose, geodetic = view.extractor.pose(message, stored.type), None

@@ -427,6 +427,22 @@ def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool
     assert refused["detail"].endswith("places base_link")
 
 
+def test_what_placed_the_robot_before_its_poses_were_recorded_is_named(tmp_path: Path) -> None:
+    """Odometry was taken into the list after ten seconds: before, transforms placed the robot."""
+    odometry = [odom(T0 + n * S // 10, n / 10) for n in range(100, 200)]
+    memory = remembered(tmp_path, [*moved(range(200)), *odometry])
+    window = {"start": T0_S + 2, "end": T0_S + 8}
+    hint = "before its first message poses are on /tf: give topic"
+    for tool, given in (("get_position_at", {"timestamp": T0_S + 5}), ("recap", window)):
+        assert hint in str(asked(memory, tool, **given))
+    assert hint in asked(memory, "trajectory_summary", **window)["detail"]
+    reply = asked(memory, "trajectory_summary", **window, topic="/tf")
+    assert reply["distance_m"] == pytest.approx(6.0)
+    late = asked(memory, "get_position_at", timestamp=T0_S + 60)["detail"]
+    assert "no message of /odom" in late
+    assert hint not in late
+
+
 def test_positions_that_are_no_numbers_are_not_said_to_be_missing(tmp_path: Path) -> None:
     poses = [odom(T0 + n * S, math.nan if 20 <= n < 40 else n) for n in range(60)]
     memory = remembered(tmp_path, poses)

@@ -40,6 +40,7 @@ from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
+    describe_earlier_poses,
     describe_lack,
     no_data_between,
     resolve_pose_topic,
@@ -532,7 +533,9 @@ def no_path(view: View, topic: str, window: TimeWindow) -> NoDataError:
     newest = view.stream.first(topics, window, newest_first=True)
     body = body_at(view, newest.time) if newest is not None and is_body else None
     if newest is None or (is_body and body is None):
-        return no_data_between(view, (topic,), window)
+        error = no_data_between(view, (topic,), window)
+        detail = error.detail + describe_earlier_poses(view, topic, window.stop)
+        return NoDataError(error.reason, detail, error.notes)
     lack = "has a valid position"
     if body is not None:
         lack = f"places {body.child}"

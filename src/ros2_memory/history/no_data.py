@@ -196,6 +196,18 @@ def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None
     return None
 
 
+def describe_earlier_poses(view: View, topic: str, before: Ns) -> str:
+    """Returns a clause on what has poses until a moment before the first message of `topic`."""
+    if view.stream.last(topic, before) is not None:
+        return ""
+    until = TimeWindow(MIN_NS, before)
+    topics = [*topics_of_robot(view, "position"), *view.moving_topics]
+    earlier = [name for name in topics if any(view.timeline.extents(name, until))]
+    if not earlier:
+        return ""
+    return f"; before its first message poses are on {listed(earlier)}: {GIVE_TOPIC}"
+
+
 def unmapped_topics_with(view: View, what: str = "position") -> list[str]:
     """Returns topics of types outside the schema map whose newest message has a pose.
 

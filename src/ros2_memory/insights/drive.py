@@ -47,7 +47,7 @@ from ros2_memory.history.driven_path import (
     slices_by_poses,
     slices_of_path,
 )
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.no_data import describe_earlier_poses, resolve_pose_topic
 from ros2_memory.history.robots import parallel_or_twice, require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS, with_runs
 
@@ -155,7 +155,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     if path is None:
         is_twice = any(pair.is_twice for pair in parallel_or_twice(view, topic, window))
         which = " that count" if is_twice else ""
-        view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown")
+        elsewhere = describe_earlier_poses(view, topic, window.stop)
+        view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown{elsewhere}")
         return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
     known = shown_window(view.snapshot, TimeWindow(begin, window.stop))
