@@ -52,7 +52,7 @@ from ros2_memory.places.pose_frames import (
     known_track,
     places_in,
 )
-from ros2_memory.places.where import Where, parse_where, places_asked
+from ros2_memory.places.where import Where, note_unplaced, parse_where, places_asked
 from ros2_memory.results import (
     ComparedMover,
     ComparedThing,
@@ -567,8 +567,12 @@ def _minutes_of(
         tracks = [(place, known_track(view, place.frame_id, window)) for place in places]
     minutes: dict[str, float | None] = {}
     for place, track in tracks:
+        if not track.reaches(window):
+            minutes[place.name] = None
+            continue
+        note_unplaced(view, track, window)
         lasted = side.drive.elapsed.among(stay.span for stay in track.inside(place.region, window))
-        minutes[place.name] = unix_from_ns(lasted) / 60 if track.reaches(window) else None
+        minutes[place.name] = unix_from_ns(lasted) / 60
     return minutes
 
 

@@ -389,11 +389,16 @@ def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
         QueryTimeoutError: the call's time runs out before any result.
     """
     known = _track_for(view, where, window)
+    note_unplaced(view, known, window)
+    return known
+
+
+def note_unplaced(view: View, known: KnownTrack, window: TimeWindow) -> None:
+    """Notes when in a window it is not known where the robot was."""
     unknown = unknown_times(view, window, placed_times(known.track, []), WHEREABOUTS, mixed=[])
     if unknown and known.reaches(window):
         named = [span_text(*span) for span in unknown[-MAX_NAMED:]]
         view.notes.add(f"{WHEREABOUTS} is not known from {listed(named, len(unknown))}")
-    return known
 
 
 def _track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:

@@ -182,6 +182,8 @@ def test_for_how_long_nobody_knows_whether_the_robot_was_in_a_place_is_said(
     note = f"{unknown} from {T0 + 10}.000001 to {T0 + 50}.000000 (40 s)"
     assert "notes" not in asked(memory, "recap", start=T0, end=T0 + 9, where=room)
     assert note in asked(memory, tool, start=T0, end=T0 + 89, where=room)["notes"]
+    two = {"with_start": T0, "with_end": T0 + 9}
+    assert note in asked(memory, "compare", start=T0 + 9, end=T0 + 89, where=room, **two)["notes"]
     there = asked(memory, "recap", start=T0 + 25, end=T0 + 35, where=room)
     assert there["visits"] == 0
     assert f"{unknown} at any time of the window" in there["notes"]
