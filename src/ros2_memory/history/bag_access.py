@@ -268,8 +268,7 @@ class BagAccess:
             topic: of the messages.
             window: of log time.
             hashed: whether tables have the hashes of all payloads, not only of latched channels.
-            columns: whether they have more than times. Without columns, messages that cannot be
-                decoded have rows, too.
+            columns: whether they have more than times.
             around: whether all messages of the bag are read, to recognise copies. There are notes
                 on the window alone.
         """

@@ -114,11 +114,7 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
 def newest_above(
     view: View, pattern: str, field: str, limit: float, window: TimeWindow | None = None
 ) -> StoredMessage | None:
-    """Returns the newest message (of a window) with a number above a limit in a field.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
-    """
+    """Returns the newest message (of a window) with a number above a limit in a field."""
     search = ReverseSearch(view, pattern, Condition(Beyond(limit, above=True), field))
     asked = window or TimeWindow.everything()
     return search.newest(asked.stop, asked.start)

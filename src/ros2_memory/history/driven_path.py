@@ -86,7 +86,7 @@ _LONGEST_H: Final = 64
 _STEP_NS: Final = NS_PER_S // 20
 """The least time between two poses by transforms."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
-"""Of a call: by topic of poses, the frame of its newest pose."""
+"""Of a view: by topic of poses, the frame of its newest pose."""
 
 
 def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
@@ -172,7 +172,6 @@ def slices_by_poses(
 
     Raises:
         InvalidArgumentsError: while it is iterated, messages carry no position.
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     if topic in view.limits.tf_topics:
         for pose_slice in pose_slices(rows_of_body(view, window), beside):
@@ -605,9 +604,6 @@ def poses_by_session(view: View, window: TimeWindow, session: Session) -> Poses:
     """Returns the poses of the body in a window by the transforms of a session, in order of time.
 
     They are in the frame of its odometry; none if no transforms lead there.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
     """
     body = robot_body(view, session)
     if body is None:

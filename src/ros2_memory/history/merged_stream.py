@@ -72,11 +72,7 @@ class MergedStream:
         *,
         newest_first: bool = False,
     ) -> Iterator[StoredMessage]:
-        """Returns the messages of the topics in the window in log-time order, each once.
-
-        Raises:
-            QueryTimeoutError: while it is iterated, when the deadline has passed.
-        """
+        """Returns the messages of the topics in the window in log-time order, each once."""
         parts = self._segment_windows(topics, window)
         return chain.from_iterable(
             self._messages_in(topics, part, newest_first=newest_first)

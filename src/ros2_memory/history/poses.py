@@ -101,9 +101,6 @@ def pose_rows(
         window: of log time.
         failures: when poses are read, messages that cannot be decoded are added to it.
         among: returns whether a recording counts.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     reader = PoseReader(view, failures)
     counting = (rows for rows in scan(view, topic, window) if among(rows.recording))

@@ -56,9 +56,9 @@ MOST_REMEMBERED: Final = 1_000
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 _OWN: Final[Key[frozenset[Path]]] = Key()
-"""Of a call: the recordings that the recorder of the bag directory made."""
+"""Of a view: the recordings that the recorder of the bag directory made."""
 _MISDATED: Final[Key[frozenset[Path]]] = Key()
-"""Of a call: the recordings with a wrong date."""
+"""Of a view: the recordings with a wrong date."""
 
 
 class _StaticTree(NamedTuple):

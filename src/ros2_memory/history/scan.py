@@ -42,11 +42,7 @@ V = TypeVar("V")
 def scan(
     view: View, topic: str, window: TimeWindow, *, newest_first: bool = False, **how: Unpack[How]
 ) -> Iterator[Rows]:
-    """Yields the rows of a topic in a window; see `open_scan` and `columns.scan.Scan.rows`.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
+    """Yields the rows of a topic in a window; see `open_scan` and `columns.scan.Scan.rows`."""
     for rows in open_scan(view, topic, window, **how).rows(newest_first=newest_first):
         view.track_thinned(TimeWindow(rows.first, rows.last + 1))
         yield rows
@@ -87,8 +83,7 @@ def open_scan(
         view: of the call.
         topic: its name.
         window: of log time.
-        columns: whether rows have more than times. Without columns, messages that cannot be decoded
-            have rows, too.
+        columns: whether rows have more than times.
         copies: whether a message counts in each recording that holds it.
         before_table: called before each table, with a log time. Rows that are left are not
             earlier; with `newest_first`, not later.
@@ -267,10 +262,14 @@ def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list
     value = read(rows)
     if value is not None:
         return [value]
-    # "" stands for all columns. A stored table lacks them because of its type: its bags do not have
-    # them either. A table of a bag may lack them because of its size.
-    left_out, is_stored = rows.table.left_out, isinstance(rows.table, StoredTable)
-    if not left_out or ("" in left_out) == is_stored:
+    left_out = rows.table.left_out
+    lacks_all = "" in left_out
+    if isinstance(rows.table, StoredTable):
+        # The bags have columns that are too large for the store, and none of a type without any.
+        bags_tell = bool(left_out) and not lacks_all
+    else:
+        bags_tell = lacks_all  # the bag was too large to hold the columns of all its messages
+    if not bags_tell:
         return None
     values: list[V] = []
     missing = len(rows)
@@ -336,9 +335,6 @@ def count_messages(
         window: of log time.
         edges: where pieces begin (ns), ascending; piece 0 is before the first edge.
         proves: whether messages themselves are read for their times: the index of a bag may lie.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
     """
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
@@ -392,9 +388,6 @@ def pick(
     """Counts the messages of a topic in a window, and picks `at_most` of them, evenly spaced.
 
     The first and the last are always picked. Each message is read when the iterator reaches it.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
     """
     firsts, _ = view.bounds(topic, window)
     edges = np.unique(firsts)

@@ -369,9 +369,6 @@ class Sessions:
 
         A transform that repeats the one before of its child is left out: each split may have all
         again. So only the messages are read whose columns show something new.
-
-        Raises:
-            QueryTimeoutError: the call's time is over.
         """
         view, cache = self._view, self._view.memory.scanner.caches.statics
         if session in self._static:

@@ -98,11 +98,7 @@ class RowCondition:
         return self._test.may_match(parts)
 
     def unstated(self, rows: Rows) -> Mask:
-        """Returns which rows of the table lack the field; of rows that count alone, if decoded.
-
-        Raises:
-            QueryTimeoutError: the call's time is over.
-        """
+        """Returns which rows of the table lack the field; of rows that count alone, if decoded."""
         unstated = self._test.unstated(rows.table)
         if unstated is not None:
             return unstated
@@ -118,9 +114,6 @@ class RowCondition:
         """Returns which rows of the table meet the condition.
 
         Bags are decoded only for rows that count.
-
-        Raises:
-            QueryTimeoutError: the call's time is over.
         """
         truth, channel = self._test.truth(rows.table), rows.table.channel
         is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
@@ -159,11 +152,7 @@ class MatchTester:
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
-        """Yields the messages of a topic in blocks that do not overlap, the newest block first.
-
-        Raises:
-            QueryTimeoutError: while it is iterated, when the deadline has passed.
-        """
+        """Yields the messages of a topic in blocks that do not overlap, the newest block first."""
         waiting: Block | None = None
         try:
             for rows in scan(

@@ -368,11 +368,7 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
 
 
 def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
-    """Returns the transforms of a session in rows, from their columns, else from their messages.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
-    """
+    """Returns the transforms of a session in rows, from their columns, else from their messages."""
     sessions = view.sessions
     if not sessions.may_hold(session, rows.recording):
         return {}
@@ -396,9 +392,6 @@ def frames_over(view: View, session: Session, window: TimeWindow, target: str) -
 
     It does not depend on how the history is cut into windows: moving transforms are also read
     around the window, and static ones hold from when they were received.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
     """
     limits = view.limits
     around = window.widened(TF_CACHE_NS)

@@ -2,7 +2,7 @@
 
 A view is a snapshot of the index, its bags, and these as one stream. Times of a question are floats
 of seconds. "Ago" counts from the wall clock or, for replayed and simulated bags (`data.now:
-latest`), from the newest recorded moment. The clock is read once for each call.
+latest`), from the newest recorded moment. A call reads the clock once (`tools/declaration.py`).
 """
 
 from __future__ import annotations
@@ -59,6 +59,8 @@ _CENSUSES: Final[Key[dict[str, dict[str, TopicTotals]]]] = Key()
 class View:
     """What one call sees of a memory; it stays the same while the call lasts.
 
+    What reads messages by it raises `QueryTimeoutError` when the call's time is over.
+
     Args:
         memory: the memory.
         call: the call.
@@ -75,7 +77,7 @@ class View:
         snapshot: the index.
         timeline: the bags in the order of time.
         notes: what the reply reports besides its answer.
-        memo: what was found out in this call.
+        memo: what was found out by this view.
     """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
