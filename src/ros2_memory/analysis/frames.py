@@ -431,14 +431,27 @@ class FrameTree:
         if link_error is not None:
             return link_error
         at = np.array(time, np.int64)
-        # In a loop, the last frame of a chain is the one before the loop closes.
-        target_root, root = ([*self._chain(frame, at)][-1] for frame in (self.target, name))
+        target_root, root = (self._root_at(frame, at) for frame in (self.target, name))
         return NoDataError(
             NoDataReason.FRAMES_NOT_CONNECTED,
-            f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because the"
-            f" tree changes or contains a loop; then their roots were '{target_root}' and '{root}';"
-            " ask about another time",
+            f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because "
+            f"{self._frame_in_both({target_root, root}, at)}; then their roots were "
+            f"'{target_root}' and '{root}'; ask about another time",
         )
+
+    def _root_at(self, frame: str, at: Ints) -> str:
+        """Returns the last frame of a chain; in a loop, the one before the loop closes."""
+        return [*self._chain(frame, at)][-1]
+
+    def _frame_in_both(self, roots: set[str], at: Ints) -> str:
+        """Returns which frame has parents in the trees of all roots around then, if one has."""
+        for frame in sorted(self._moving):
+            history = self._history(frame)
+            parents = [] if history is None else sorted(history.parents)
+            if len(parents) > 1 and roots <= {self._root_at(parent, at) for parent in parents}:
+                named = listed([f"'{parent}'" for parent in parents])
+                return f"'{frame}' has the parents {named} around then, as where two nodes place it"
+        return "the tree changes or contains a loop"
 
     def _never_connected(self, name: str) -> NoDataError:
         """Returns the error for two known frames that are in different trees at all times."""

@@ -273,6 +273,20 @@ def test_of_a_frame_that_is_seen_now_and_then_the_nearest_time_is_named(
         assert found["translation"]["x"] == 5.0
 
 
+def test_a_frame_that_two_nodes_place_in_two_parents_is_named(tmp_path: Path) -> None:
+    """As by odometry and by a localiser, which should place the frame of odometry instead."""
+    messages = moving(T0, 20, "odom", "base_link", 0.0, 0.1)
+    for at in range(T0, T0 + 20 * S, S // 2):
+        messages.append(tf(at + 1000, transform(at + 1000, "map", "base_link", (1.0, 0.0, 0.0))))
+    record(tmp_path / "one", sorted(messages, key=lambda message: message.log_time))
+    memory = memory_of(tmp_path)
+    for child in ("odom", "base_link"):
+        refused = looked_up(memory, T0 + 10 * S + S // 5, "map", child)
+        assert refused["reason"] == "frames_not_connected"
+        said = "because 'base_link' has the parents 'map', 'odom' around then, as where two nodes "
+        assert said in refused["detail"]
+
+
 def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     """Neither listed, nor a reason to advise another time."""
     nameless = moving(T0, 20, "", "base_link", 0.0, 0.0)
