@@ -138,10 +138,9 @@ class View:
 
         So it has all fields that its type can have.
         """
-        if self.extractor.is_mapped(stored.type):
-            return value
         definition = self.bags.memory.reader.definition(stored.record.channel)
-        return value if definition is None else with_elements(value, definition)
+        paths = self.extractor.plan(stored.type).fields
+        return value if definition is None else with_elements(value, definition, paths)
 
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
         """Returns the first and last log times of a topic in each bag of a window, or near it."""

@@ -236,6 +236,21 @@ def test_a_refusal_names_the_fields_of_what_a_list_has_that_is_empty_now(tmp_pat
     assert ("statistics.data", "number") in described
 
 
+def test_a_detector_that_sees_nothing_for_long_has_the_fields_of_a_detection(
+    tmp_path: Path,
+) -> None:
+    """Also of a type in the schema map."""
+    seen = [detections(T0 + second * NS_PER_S, []) for second in range(9)]
+    memory = remembered(tmp_path, seen)
+    given = {"topic": SCENE, "condition_type": "above", "field": "confidence", "value": 0.5}
+    refused = asked(memory, "find_matches", **given)["detail"]
+    assert refused.endswith(
+        "their fields are: skill, detections, detections.label, detections.score, "
+        "detections.point, detections.bbox, detections.point.x, detections.point.y, "
+        "detections.point.z"
+    )
+
+
 @pytest.mark.parametrize("points", [(), (7.0,), (7.0, 8.0)])
 def test_a_value_in_a_list_is_refused_with_one_of_its_elements(
     tmp_path: Path, points: tuple[float, ...]
