@@ -137,6 +137,21 @@ def summary_conditions(field: str | None, value: JsonValue) -> list[Condition]:
     return [Condition(Beyond(-1, above=True), size) for size in sizes]
 
 
+def fields_of_constant(constant: str, value: JsonValue) -> list[str]:
+    """Returns the dot-paths of the numbers whose names begin a constant: `cause` of `CAUSE_FALL`.
+
+    Of a name of several words the last one is enough: `shore_power_state` of `STATE_OFF`.
+    """
+    fields: list[str] = []
+    for path in dict.fromkeys(_dot_paths(value, "")):
+        name = path.rpartition(".")[2]
+        words = (name, name.rpartition("_")[2])
+        begins = any(constant.lower().startswith(f"{word}_") for word in words)
+        if begins and any(type(leaf) is int for leaf in at_field(value, path)):
+            fields.append(path)
+    return fields
+
+
 def _is_array(value: JsonValue) -> bool:
     """Returns whether a value is or may be an array of numbers or booleans, or its summary."""
     if isinstance(value, list):

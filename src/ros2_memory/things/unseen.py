@@ -16,6 +16,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.facts import GOALS
+from ros2_memory.analysis.refusals import fields_of_constant
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
@@ -241,7 +242,24 @@ def _named_numbers(view: View, topics: Sequence[str], condition: Condition) -> t
     if not named:
         return ()
     of_types = listed([f"{constant} ({type_name})" for constant, type_name in named.items()])
-    return (f"{abbreviate(word)} names {of_types}: ask equals on the field of that number",)
+    fields = listed([*dict.fromkeys(_fields_of_constants(view, topics, [*named]))])
+    such = f", such as {fields}" if fields else ""
+    return (f"{abbreviate(word)} names {of_types}: ask equals on the field of that number{such}",)
+
+
+def _fields_of_constants(
+    view: View, topics: Sequence[str], constants: Sequence[str]
+) -> Iterator[str]:
+    """Yields the fields of the topics' newest messages whose names begin those of constants."""
+    for topic in topics[:_MOST_TYPES]:
+        stored = None
+        with suppress(QueryTimeoutError):
+            stored = view.stream.last(topic)
+        if stored is None:
+            continue
+        value = view.with_examples(view.value(stored), stored)
+        for constant in constants:
+            yield from fields_of_constant(constant.partition(" ")[0], value)
 
 
 def _found_otherwise_spelt(

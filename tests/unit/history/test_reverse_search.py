@@ -286,7 +286,7 @@ def test_never_of_a_word_names_the_constant_that_has_it(
     memory = remembered(tmp_path, messages)
     note = (
         f'"{word.lower()}" names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
-        "ask equals on the field of that number"
+        "ask equals on the field of that number, such as state"
     )
     for topic in ("/winch", "/winch*"):
         question = (memory, Call(), topic, kind)
