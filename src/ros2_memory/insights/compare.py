@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
@@ -66,9 +66,11 @@ from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay, most
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import (
+    Scattered,
     describe_hung,
     look_alike_notes,
     note_undecoded,
+    scatter_notes,
     unplaced_notes,
     vague_notes,
 )
@@ -96,6 +98,7 @@ _LEAST_MINUTES: Final = 0.2
 _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
 _LEAST_RECORDED_S: Final = 10.0
+_MOST_SCATTERED: Final = 300
 _SAME_MOVER_M: Final = 1.0
 """People and pets that were last seen so near to where they were before are where they were."""
 
@@ -278,8 +281,9 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     windows = earlier, later
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, windows))
     places = places_asked(limits, where, things.frames)
-    compared, moves = _ThingsBetween(things, earlier, later, where, places).compare()
-    view.notes.add(*look_alike_notes(things, moves))
+    between = _ThingsBetween(things, earlier, later, where, places)
+    compared, moves = between.compare()
+    view.notes.add(*look_alike_notes(things, moves), *scatter_notes(between.scattered(compared)))
     return frame, compared
 
 
@@ -355,6 +359,21 @@ class _ThingsBetween:
         ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers), moves
+
+    def scattered(self, compared: ComparedThings) -> Iterator[Scattered]:
+        """Yields the things of the labels of which one came or went, as of the newest detections.
+
+        They are as many as a note can look through.
+        """
+        came_or_went = (*compared.appeared, *compared.not_seen_where_expected)
+        labels = {thing.label for thing in (*came_or_went, *compared.not_looked_at)}
+        of_labels = (
+            instance for instance in self.known.estimate.instances if instance.label in labels
+        )
+        for instance in islice(of_labels, _MOST_SCATTERED):
+            stay = instance.stays[-1]
+            frame = self.known.frames[instance.epoch]
+            yield Scattered(instance.label, frame, stay.at, stay.dev_mm / 1000)
 
     def _is_inside(self, instance: Instance, stay: _StayInWindow | None) -> bool:
         """Returns whether a thing has a stay in the region."""

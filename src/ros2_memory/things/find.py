@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
-from ros2_memory.core.text import abbreviate, repeating
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
@@ -36,11 +36,13 @@ from ros2_memory.things.instances import (
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import (
+    Scattered,
     ThingsQuestion,
     describe_hung,
     look_alike_notes,
     note_undecoded,
     notes_on,
+    scatter_notes,
 )
 
 if TYPE_CHECKING:
@@ -56,8 +58,6 @@ _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
 """Detectors publish at their own times."""
 _MM: Final = 1000.0
-_SCATTERS: Final = 3.0
-"""Things of one label that are no farther apart than so many times their scatter may be one."""
 
 
 def find_things(
@@ -144,26 +144,13 @@ def find_things(
         notes=(
             *view.notes.sentences(),
             *notes_on(view, known.by_all, question),
-            *_describe_scatter(shown),
+            *scatter_notes(
+                Scattered(thing.label, thing.frame_id, thing.place, thing.spread_m)
+                for thing in shown
+                if not thing.moves
+            ),
         ),
     )
-
-
-def _describe_scatter(shown: Sequence[Thing]) -> Iterator[str]:
-    """Yields for a label whether two of its things are so near that noise may have parted them."""
-    nearest: dict[str, tuple[float, float]] = {}
-    for one, other in combinations([thing for thing in shown if not thing.moves], 2):
-        if (one.label, one.frame_id) != (other.label, other.frame_id):
-            continue
-        away_m, spread_m = math.dist(one.place, other.place), max(one.spread_m, other.spread_m)
-        if away_m <= _SCATTERS * spread_m:
-            nearest[one.label] = min((away_m, spread_m), nearest.get(one.label, (math.inf, 0.0)))
-    for label, (away_m, spread_m) in nearest.items():
-        yield repeating(
-            f"{label}: two of these are only {away_m:.2f} m apart, where detections of it scatter "
-            f"by {spread_m:.2f} m (spread_m): they may be one thing",
-            [label],
-        )
 
 
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:

@@ -6,10 +6,11 @@ A detection is without a thing if there are too few, if its score is too low, or
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -55,11 +56,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.model import Vector3
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.things.instances import Move
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
+_SCATTERS: Final = 3.0
+"""Things of one label that are no farther apart than so many times their scatter may be one."""
 _MOST_TYPES: Final = 3
 """The constants of this many types are looked up: each reads the channels of a file."""
 _ARTICLE: Final = re.compile(r"^(?:an?|the) ")
@@ -365,6 +369,32 @@ def vague_notes(
             "localisation was poor when these were detected last, which moves nothing, so that "
             f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
             labels,
+        )
+
+
+class Scattered(NamedTuple):
+    """A thing in a reply, with how far (m) its detections scatter around its place (m)."""
+
+    label: str
+    frame_id: str
+    place: Vector3
+    spread_m: float
+
+
+def scatter_notes(things: Iterable[Scattered]) -> Iterator[str]:
+    """Yields for a label whether two of its things are so near that noise may have parted them."""
+    nearest: dict[str, tuple[float, float]] = {}
+    for one, other in combinations(things, 2):
+        if (one.label, one.frame_id) != (other.label, other.frame_id):
+            continue
+        away_m, spread_m = math.dist(one.place, other.place), max(one.spread_m, other.spread_m)
+        if away_m <= _SCATTERS * spread_m:
+            nearest[one.label] = min((away_m, spread_m), nearest.get(one.label, (math.inf, 0.0)))
+    for label, (away_m, spread_m) in nearest.items():
+        yield repeating(
+            f"{label}: two of these are only {away_m:.2f} m apart, where detections of it scatter "
+            f"by {spread_m:.2f} m: they may be one thing",
+            [label],
         )
 
 

@@ -201,6 +201,10 @@ def test_things_that_are_nearer_to_each_other_than_noise_throws_detections_are_t
     assert bool(told) == is_told
     if told:
         assert re.match(r"cup: two of these are only [01]\.\d\d m apart", told[0])
+    windows = {"start": BEGIN + 150, "end": BEGIN + 300, "with_start": BEGIN, "with_end": BEGIN}
+    compared = asked(memory_of(tmp_path), "compare", **windows)
+    assert compared["things"].keys() & {"appeared", "not_looked_at"}
+    assert ("they may be one thing" in str(compared["notes"])) == is_told
 
 
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
