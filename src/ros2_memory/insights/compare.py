@@ -99,6 +99,8 @@ _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
 _LEAST_RECORDED_S: Final = 10.0
 _MOST_SCATTERED: Final = 300
+_OF_WINDOWS: Final = ("from start to end: ", "from with_start to with_end: ")
+"""How notes on one of the two windows begin."""
 _SAME_MOVER_M: Final = 1.0
 """People and pets that were last seen so near to where they were before are where they were."""
 
@@ -136,8 +138,9 @@ def compare(
     frame, things = _compare_things(sides, region)
     minutes = _minutes_in_places(sides, region)
     way_frame, stood = _compare_standstills(sides, region)
-    note_unread(this.view, this.window, of="from start to end: ", gaps=False)
-    note_unread(that.view, that.window, of="from with_start to with_end: ", gaps=False)
+    _note_lengths(sides)
+    for side, of in zip(sides, _OF_WINDOWS, strict=True):
+        note_unread(side.view, side.window, of=of, gaps=False)
     notes = this.view.notes
     if differ(this.recorded_s, that.recorded_s, _LEAST_RECORDED_S):
         notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
@@ -233,7 +236,7 @@ def _side_of(view: View, window: TimeWindow) -> _Side:
         is_recorded,
         drive,
         known_placement(view),
-        _path_numbers(view, drive, window),
+        _path_numbers(drive, window),
         _error_counts(view, window),
         _silent_seconds(view, window),
         unix_from_ns(drive.elapsed.between(*window.asked())),
@@ -496,12 +499,11 @@ def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
     return -seen.end, thing.label
 
 
-def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
+def _path_numbers(drive: Drive, window: TimeWindow) -> dict[str, float | None]:
     """Returns the numbers of a path by the names in `_LEAST`; None for an unknown number."""
     trajectory = drive.valid_trajectory
     if trajectory is None:
         return dict.fromkeys(_LEAST)
-    view.notes.add(*length_notes(trajectory))
     start, end = window.asked()
     stood = drive.stood(end - start)
     return {
@@ -510,6 +512,15 @@ def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, flo
         "stood_s": None if stood is None else unix_from_ns(stood),
         "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
+
+
+def _note_lengths(sides: tuple[_Side, _Side]) -> None:
+    """Notes what the length of each path leaves out; what holds for both windows once."""
+    trajectories = [side.drive.valid_trajectory for side in sides]
+    of_sides = [() if path is None else tuple(length_notes(path)) for path in trajectories]
+    of_both = set.intersection(*map(set, of_sides))
+    for side, own_notes, of in zip(sides, of_sides, _OF_WINDOWS, strict=True):
+        side.view.notes.add(*(note if note in of_both else f"{of}{note}" for note in own_notes))
 
 
 def _compare_standstills(

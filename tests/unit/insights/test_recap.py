@@ -594,6 +594,22 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
         assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
 
 
+def test_a_comparison_says_which_of_the_two_paths_has_a_gap(tmp_path: Path) -> None:
+    legs = [odom(BEGIN + n * S // 10, n / 50) for n in range(300)]
+    legs += [odom(BEGIN + 60 * S + n * S // 10, 10.0 + n / 50) for n in range(300)]
+    memory = remembered(tmp_path, legs)
+    whole, part = (T0, T0 + 90), (T0, T0 + 20)
+    gap = "1 gap without a pose, 4.02 m across in straight lines (gap_m): left out of distance_m"
+    for this, other, of in (
+        (whole, part, "from start to end: "),
+        (part, whole, "from with_start to with_end: "),
+        (whole, (T0, T0 + 85), ""),
+    ):
+        windows = dict(zip(("start", "end", "with_start", "with_end"), this + other, strict=True))
+        notes = asked(memory, "compare", **windows)["notes"]
+        assert [note for note in notes if "without a pose" in note] == [of + gap]
+
+
 @pytest.mark.parametrize("map_frame", ["odom", "map"])
 def test_how_far_it_is_across_a_gap_is_unknown_where_odometry_began_anew(
     tmp_path: Path, map_frame: str
