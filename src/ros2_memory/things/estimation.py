@@ -43,6 +43,7 @@ from ros2_memory.things.stays import (
     FEWEST,
     LabelGroup,
     Observations,
+    end_where_carried_away,
     groups_in,
     lowest_bin,
     placed_stays,
@@ -255,6 +256,8 @@ def _add_stays(groups: Sequence[LabelGroup], observed: Observations) -> None:
         group.evidence = evidence
     for stay in placed_stays(observed, stays, rows[in_ranges(begin, end - begin)], end - begin):
         groups[group_of[stay.place]].stays.append(stay)
+    for group in groups:
+        end_where_carried_away(group, observed)
 
 
 def _link(group: LabelGroup, observed: Observations) -> list[Instance]:

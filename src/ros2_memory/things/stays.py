@@ -6,6 +6,7 @@ it there, is that other thing under a wrong name.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from itertools import groupby
 from operator import itemgetter
@@ -33,7 +34,7 @@ from ros2_memory.core.arrays import (
     rows_by,
     stable_order,
 )
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.things.carried import carried_spots
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
 from ros2_memory.things.labels import moves_by_itself
@@ -67,6 +68,9 @@ _BESIDE_SHARE: Final = 0.2
 """A label that is beside the host in this share of its detections is a thing of its own."""
 _VIEW_SHARE: Final = 0.02
 """The share of detections outside of each side of a field of view: they are mistaken."""
+_TAKEN_NS: Final = 20 * NS_PER_S
+_TAKEN_MM: Final = 2000.0
+"""A robot that takes a thing along drives within so much time, and is first seen to so near."""
 _STAYS_AT_ONCE: Final = 64
 """Stays that are compared with all others at once."""
 
@@ -76,7 +80,8 @@ class LabelGroup:
     """The spots of one label in one epoch, to which estimating adds places, stays and evidence.
 
     Attributes:
-        rows: the spots.
+        rows: the spots that count.
+        carried: the spots of what the robot carried.
         unplaced: rows of `Sights.unplaced` with the label, in all epochs.
         places: the spots at each place.
     """
@@ -84,6 +89,7 @@ class LabelGroup:
     key: str
     epoch: int
     rows: Ints
+    carried: Ints
     unplaced: Ints
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
@@ -189,13 +195,16 @@ def groups_in(observed: Observations, keys: Sequence[str]) -> list[LabelGroup]:
     width = len(distinct) + 1
     epoch = observed.sights.epochs[spots[:, Spot.SLICE]]
     group_of = epoch * width + key_of_label[spots[:, Spot.LABEL]]
-    counting = np.flatnonzero(observed.counts)
+    counting, carried = np.flatnonzero(observed.counts), np.flatnonzero(observed.carried)
     numbers, nth = np.unique(group_of[counting], return_inverse=True)
     lost = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(distinct))
     groups = []
     for number, rows in zip(numbers.tolist(), rows_by(nth, len(numbers)), strict=True):
         group_epoch, key = divmod(number, width)
-        groups.append(LabelGroup(distinct[key], group_epoch, counting[rows], unplaced[lost[key]]))
+        moving = carried[group_of[carried] == number]
+        groups.append(
+            LabelGroup(distinct[key], group_epoch, counting[rows], moving, unplaced[lost[key]])
+        )
     return groups
 
 
@@ -245,6 +254,20 @@ def placed_stays(
         )
         for number, (place, stay) in enumerate(stays)
     ]
+
+
+def end_where_carried_away(group: LabelGroup, observed: Observations) -> None:
+    """Ends the stays from which the robot took the thing along, if they were not seen to end."""
+    spots = observed.sights.spots[group.carried]
+    spots = spots[np.argsort(spots[:, Spot.FIRST])]
+    for stay in group.stays:
+        nth = int(np.searchsorted(spots[:, Spot.FIRST], stay.last, side="right"))
+        if stay.left is not None or nth == len(spots):
+            continue
+        taken = spots[nth]
+        away_mm = math.hypot(taken[Spot.X] - stay.x, taken[Spot.Y] - stay.y)
+        if taken[Spot.FIRST] - stay.last <= _TAKEN_NS and away_mm <= _TAKEN_MM:
+            stay.left = int(taken[Spot.FIRST])
 
 
 def remove_false_stays(

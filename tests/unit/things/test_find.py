@@ -731,6 +731,18 @@ def test_where_the_robot_passed_with_what_it_carries_is_no_place_of_it(tmp_path:
         assert changed == {}
 
 
+def test_a_thing_that_the_robot_took_along_is_one_though_nobody_looked_back(tmp_path: Path) -> None:
+    """It grasps a cup before it, turns with it, drives to x = -9, and puts it down there."""
+    messages = looked(0, 40, HERE, ("cup", 1.9, 0.0))
+    for at in range(21):
+        x = 1.0 - at / 2
+        messages += scene(40 + at, (x, 0.0, math.pi), [("cup", x - 0.6, 0.0)])
+    messages += looked(61, 90, (-9.0, 0.0, math.pi), ("cup", -10.1, 0.1))
+    [cup] = told_of(tmp_path, messages, label="cup")["things"]
+    assert cup["place"]["x"] == pytest.approx(-10.1, abs=0.05)
+    assert cup["moved"][0]["place"]["x"] == pytest.approx(1.9, abs=0.05)
+
+
 def test_two_labels_that_stand_apart_are_two_things_though_no_message_has_both(
     tmp_path: Path,
 ) -> None:
