@@ -329,7 +329,7 @@ class Visit:
     "exits",
     TIME("first_entry", "first").if_known,
     TIME("last_exit", "last").if_known,
-    LOCAL_OF_DAYS("local", "first", "last"),
+    LOCAL_OF_DAYS("local", "first", "last_after_first"),
 )
 class PlaceVisits:
     """How long the robot was in a named place, and how often it was seen to enter and to leave.
@@ -343,6 +343,11 @@ class PlaceVisits:
     duration: Ns
     first: Ns | None
     last: Ns | None
+
+    @property
+    def last_after_first(self) -> Ns | None:
+        """The last exit; None if it was before the first entry: then the two are no stretch."""
+        return None if self.first and self.last and self.last < self.first else self.last
 
 
 @result(

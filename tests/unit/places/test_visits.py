@@ -33,7 +33,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.clocks import SettableClock
+from tests.support.clocks import SettableClock, in_zone
 from tests.support.examples import LONG, examples
 from tests.support.memories import asked, each_way, memory_of, remembered, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
@@ -302,6 +302,18 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
 def spots(memory: Memory, **where: Circle | Rectangle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
+
+
+def test_a_robot_that_left_before_it_first_came_has_no_time_that_runs_backwards(
+    tmp_path: Path,
+) -> None:
+    """It leaves its dock after 10 s, for 40 s."""
+    memory = remembering(tmp_path, line((10, 0.0), (20, 0.5), (20, -0.5), (30, 0.0)))
+    with in_zone("UTC"):
+        [dock] = asked(spots(memory, dock=Circle(0.0, 0.0, 1.0)), "visits")["places"]
+    assert dock["last_exit"] == pytest.approx(T0 + 12, abs=0.3)
+    assert dock["first_entry"] == pytest.approx(T0 + 48, abs=0.3)
+    assert dock["local"] == "Tue 2026-07-14 03:34:08"
 
 
 def test_a_place_that_the_robot_passes_more_often_than_poses_are_always_read_for_has_no_visit(
