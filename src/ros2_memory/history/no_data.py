@@ -198,12 +198,14 @@ def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None
 
 def describe_earlier_poses(view: View, topic: str, before: Ns) -> str:
     """Returns a clause on what has poses until a moment before the first message of `topic`."""
-    if view.stream.last(topic, before) is not None:
-        return ""
     until = TimeWindow(MIN_NS, before)
+
+    def is_heard(name: str) -> bool:
+        return any(view.timeline.extents(name, until))
+
     topics = [*topics_of_robot(view, "position"), *view.moving_topics]
-    earlier = [name for name in topics if any(view.timeline.extents(name, until))]
-    if not earlier:
+    earlier = [*filter(is_heard, topics)]
+    if is_heard(topic) or not earlier:
         return ""
     return f"; before its first message poses are on {listed(earlier)}: {GIVE_TOPIC}"
 
