@@ -27,6 +27,7 @@ from ros2_memory.columns.kinds import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import without
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -39,7 +40,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.clock_steps import elapsed_in
-from ros2_memory.history.coverage import recording_gaps, shown_window
+from ros2_memory.history.coverage import recording_gaps, shown_span, span_text
 from ros2_memory.history.driven_path import (
     PoseSlice,
     driven_path,
@@ -159,9 +160,13 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown{elsewhere}")
         return Drive(elapsed, None, None, standstills, drops)
     trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
-    known = shown_window(view.snapshot, TimeWindow(begin, window.stop))
-    spans = without([known.asked()], [*recording_gaps(view, known)])
-    recorded = elapsed.among(spans)
+    window = TimeWindow(begin, window.stop)
+    (start, end), gaps = shown_span(view.snapshot, window), [*recording_gaps(view, window)]
+    recorded = elapsed.among(without([(start, end)], gaps))
+    beyond = without([(start, path.first), (path.last, end)], gaps)
+    long = [span_text(*span) for span in beyond if span[1] - span[0] > NEWEST_POSE_NS]
+    if long:
+        view.notes.add(f"{topic} has no poses from {listed(long)}: the path is without that time")
     return Drive(elapsed, path, trajectory, standstills, drops, recorded)
 
 

@@ -171,6 +171,25 @@ def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Pa
     ]
 
 
+def test_a_path_that_begins_or_ends_within_a_window_says_when_there_are_no_poses(
+    tmp_path: Path,
+) -> None:
+    """Poses are recorded from 60 to 120 s."""
+    poses = [odom(BEGIN + t * S, 0.1 * t) for t in range(60, 121)]
+    beats = [boolean(BEGIN + t * S, True) for t in range(181)]
+    memory = remembered(tmp_path, [*poses, *beats])
+    spans = [f"{T0 + first}.000000 to {T0 + first + 60}.000000 (60 s)" for first in (0, 120)]
+    note = f"/odom has no poses from {', '.join(spans)}: the path is without that time"
+    assert note in asked(memory, "recap", start=T0, end=T0 + 180)["notes"]
+    late, early = (
+        f"/odom has no poses from {span}: the path is without that time" for span in spans
+    )
+    halves = {"start": T0, "end": T0 + 90, "with_start": T0 + 90, "with_end": T0 + 180}
+    assert {late, early} <= {*asked(memory, "compare", **halves)["notes"]}
+    whole = asked(memory, "recap", start=T0 + 65, end=T0 + 125)
+    assert "no poses" not in str(whole)
+
+
 @pytest.mark.parametrize("tool", ["recap", "trajectory_summary"])
 def test_for_how_long_nobody_knows_whether_the_robot_was_in_a_place_is_said(
     tmp_path: Path, tool: str
