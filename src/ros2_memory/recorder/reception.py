@@ -255,20 +255,23 @@ class Reception:
         """Counts the losses that only a further split could disprove: recording has ended."""
         self.background.add(_TASK, self._flush)
 
-    def note_lost(self, recording: str, topic: str, count: int) -> None:
-        """Notes that rosbag2 reports lost messages of a topic, up to a recording's last split."""
-        self.background.add(_TASK, lambda: self._add_reported(recording, topic, count))
+    def note_lost(self, recording: str, topic: str, count: int, lived: Span) -> None:
+        """Notes that rosbag2 reports lost messages of a topic, up to a recording's last split.
+
+        `lived`: when the recording ran (wall time), for one of which no split shows it.
+        """
+        self.background.add(_TASK, lambda: self._add_reported(recording, topic, count, lived))
 
     def _flush(self) -> None:
         with self._lock:
             losses = self._losses.flush()
         self._report_losses(losses)
 
-    def _add_reported(self, recording: str, topic: str, count: int) -> None:
+    def _add_reported(self, recording: str, topic: str, count: int, lived: Span) -> None:
         with self._lock:
             state = self._recordings.get(recording)
             span = None if state is None else state.span
-            start, stop = span or (0, 0)
+            start, stop = span or lived
             losses = self._losses.add_reported(topic, start, stop, count)
         self._report_losses(losses)
 

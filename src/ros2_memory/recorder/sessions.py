@@ -589,8 +589,9 @@ class RecordingSessions:
             self.orders.reception.learn(session.name, session.splits.directory / name)
         if closed or session.state is SessionState.ENDED:
             # After `learn`: what a split itself shows to be missing is counted first.
+            lived = session.began.wall, now.wall
             for topic, count in session.take_lost().items():
-                self.orders.reception.note_lost(session.name, topic, count)
+                self.orders.reception.note_lost(session.name, topic, count, lived)
         if closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s

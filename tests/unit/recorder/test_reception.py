@@ -280,11 +280,11 @@ def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
     made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 20, 10))
-    made.note_lost("a", "/odom", 3)  # which the stamps of that split would show
+    made.note_lost("a", "/odom", 3, (0, 1))  # which the stamps of that split would show
     assert read_losses(tmp_path, MIN_NS, MAX_NS) == []
     monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
     made.learn("a", split(tmp_path / "a_1.mcap", 20, 20))
-    made.note_lost("a", "/odom", 7)
+    made.note_lost("a", "/odom", 7, (0, 1))
     [loss] = read_losses(tmp_path, MIN_NS, MAX_NS)
     assert (loss.topic, loss.lost, loss.by) == ("/odom", 7, "rosbag2")
 

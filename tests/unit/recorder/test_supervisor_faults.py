@@ -28,6 +28,7 @@ from tests.support.bags import odom
 from tests.support.fakes import broken
 from tests.support.housekeepers import keeper_of
 from tests.support.simulated_recorders import (
+    T0,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -352,7 +353,8 @@ def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(tmp_path: Pa
     world.recorders[0].ends_with = -9
     with unmounted(world):
         world.run(0.25)
-        world.orders.reception.note_lost(world.recorders[0].directory.name, "/door", 3)
+        name = world.recorders[0].directory.name
+        world.orders.reception.note_lost(name, "/door", 3, (T0, world.wall))
         world.run(20)
         assert list(bag_dir.iterdir()) == []
     world.run(20)
@@ -388,6 +390,18 @@ def test_what_ros2_bag_counts_as_lost_is_said_of_the_time_until_the_split_that_c
     assert lost_in(tmp_path) == [("/door", 5, "rosbag2"), ("/door", 7, "rosbag2")]
     early, late = read_losses(tmp_path, MIN_NS, MAX_NS)
     assert first <= early.start < early.stop < last <= late.stop
+
+
+def test_what_was_lost_before_a_first_split_closed_is_said_of_the_time_until_the_death(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path).started(3)
+    world.recorders[0].lines.append("\t/door: 5")
+    world.recorders[0].die()
+    world.run(3)
+    assert world.heartbeat()["lost"] == {"/door": 5}
+    [loss] = (each for each in read_losses(tmp_path, T0, world.wall) if each.by == "rosbag2")
+    assert (loss.start, loss.stop) == (T0, T0 + 13 * NS_PER_S // 4)
 
 
 def test_what_the_messages_themselves_show_to_be_missing_counts_once(
@@ -427,7 +441,7 @@ def test_what_failed_in_the_background_is_told(world: World) -> None:
     lost = world.bag_dir / LOST_FILE
     lost.mkdir()
     name = world.recorders[0].directory.name
-    world.orders.reception.note_lost(name, "/door", 3)
+    world.orders.reception.note_lost(name, "/door", 3, (T0, world.wall))
     [reported] = world.logged(5, "housekeeping_failed")
     assert (reported["task"], "losses" in reported["reason"]) == ("reception", True)
     world.run(30)
