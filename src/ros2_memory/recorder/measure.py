@@ -31,6 +31,8 @@ RECENT: Final = 6
 """A message, or a recording, that is missing for so many splits does not come any more."""
 FEWEST: Final = 10
 """Fewer messages show no cadence."""
+_SETTLED_KEPT: Final = 30
+"""So many older messages show the cadence of a topic that has few in a split."""
 REGULAR: Final = 0.9
 """The share of all steps that must be of one length, or there is no cadence."""
 LONGEST_NS: Final[Ns] = 5 * NS_PER_S
@@ -109,14 +111,16 @@ class Hole(NamedTuple):
 
 @dataclass(slots=True)
 class _Series:
-    """The messages of a topic since the newest settled one, by value.
+    """The newest messages of a topic, by value.
 
-    `heard` is the number of splits that had been measured when the topic last came.
+    `heard` is the number of splits that had been measured when the topic last came. What is missing
+    up to the value `settled` was counted.
     """
 
     kind: Kind
     positions: list[Position]
     heard: int
+    settled: int
 
 
 class _Reached(NamedTuple):
@@ -193,15 +197,15 @@ class LossCounter:
         if back and last.value < positions[back[0] - 1].value:
             # The publisher began anew. Otherwise an earlier message came again, as latched.
             series, positions = None, positions[back[0] :]
-        elif series is not None and last.value < series.positions[0].value:
+        elif series is not None and last.value < series.settled:
             series = None  # it began anew between two splits, or the clock was set back
         known = [] if series is None else series.positions
+        settled = min(positions).value if series is None else series.settled
         earliest: dict[int, Ns] = {}
-        for value, log_time in (*known, *positions):
+        for value, log_time in (*known, *(new for new in positions if new.value >= settled)):
             earliest[value] = min(log_time, earliest.get(value, log_time))
-        first = known[0].value if known else min(earliest)
-        merged = [Position(value, earliest[value]) for value in sorted(earliest) if value >= first]
-        self._series[topic] = _Series(progress.kind, merged, self._measured)
+        merged = [Position(value, earliest[value]) for value in sorted(earliest)]
+        self._series[topic] = _Series(progress.kind, merged, self._measured, settled)
 
     def _settle(self, until: Ns) -> list[Loss]:
         """Returns the losses up to a log time that all recordings have reached, each once."""
@@ -216,6 +220,8 @@ class LossCounter:
                 if position.log_time <= until:
                     settled = index
             for hole in topic_holes or ():
+                if hole.before.value < series.settled:
+                    continue
                 if hole.after.value > series.positions[settled].value:
                     break
                 if hole.is_open and not is_over:
@@ -224,7 +230,8 @@ class LossCounter:
                 # The clock may have been set back between them.
                 start, stop = sorted((hole.before.log_time, hole.after.log_time))
                 losses.append(Loss(topic, start, stop, hole.missing, series.kind))
-            series.positions = series.positions[settled:]
+            series.settled = max(series.settled, series.positions[settled].value)
+            series.positions = series.positions[max(0, settled - _SETTLED_KEPT) :]
         self._lately += losses
         return losses
 

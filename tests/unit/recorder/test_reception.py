@@ -489,6 +489,12 @@ def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     assert counter.in_last_hour(loss.stop + NS_PER_HOUR) == {}
 
 
+def test_losses_of_a_topic_with_few_messages_in_each_split_count() -> None:
+    kept = [tick for tick in range(100) if tick not in {40, 71}]
+    splits = [("a", progress(kept[first : first + 5])) for first in range(0, 98, 5)]
+    assert lost_in(LossCounter(), *splits) == [1, 1]
+
+
 @given(order=st.permutations(["old", "old", "old", "new", "new", "new"]), taken=st.booleans())
 def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
     order: list[str], taken: bool
