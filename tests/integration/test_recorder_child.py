@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -285,6 +286,15 @@ def test_a_bounded_run_kills_what_takes_too_long_with_all_it_started(tmp_path: P
             break
     pid = int(told.read_text())
     until(lambda: is_dead(pid))
+
+
+def test_a_bounded_run_needs_no_temporary_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null")
+    body = "print('out'); print('error', file=sys.stderr)"
+    ran = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
+    assert (ran.stdout, ran.stderr) == (b"out\n", b"error\n")
 
 
 def test_a_bounded_run_does_not_wait_for_what_goes_on_in_the_background(tmp_path: Path) -> None:

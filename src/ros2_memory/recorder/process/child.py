@@ -13,7 +13,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections import deque
@@ -170,12 +169,16 @@ def run_bounded(
 ) -> subprocess.CompletedProcess[bytes]:
     """Runs a program to its end, without waiting for processes that it leaves running.
 
-    Its output goes to files: `subprocess.run` would wait until every copy of a pipe is closed.
+    Its output goes to files, in memory: `subprocess.run` would wait until every copy of a pipe is
+    closed.
 
     Raises:
         RecorderError: the program cannot be started, or runs for longer than `timeout_s`.
     """
-    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+    with (
+        os.fdopen(os.memfd_create("output"), "rb") as output,
+        os.fdopen(os.memfd_create("errors"), "rb") as errors,
+    ):
         process = _spawn(argv, env, output.fileno(), errors.fileno(), ())
         try:
             status = process.wait(timeout_s)

@@ -220,11 +220,17 @@ def find_installation(setup_files: Sequence[Path], log_dir: Path) -> Installatio
     """
     env = robot_environment(setup_files, log_dir)
     ros2 = find_ros2(env)
-    # `ros2-memory doctor` calls this as well: no log goes beside the bags.
-    with TemporaryDirectory() as elsewhere:
-        finished = run_bounded(
-            [ros2, *HELP_ARGV], {**env, "ROS_LOG_DIR": elsewhere}, HELP_TIMEOUT_S
-        )
+    try:
+        # `ros2-memory doctor` calls this as well: no log goes beside the bags.
+        with TemporaryDirectory() as elsewhere:
+            finished = run_bounded(
+                [ros2, *HELP_ARGV], {**env, "ROS_LOG_DIR": elsewhere}, HELP_TIMEOUT_S
+            )
+    except OSError as error:
+        raise RecorderError(
+            f"no temporary folder can be made: {error.strerror or error}; free its disk, or name "
+            "another folder in TMPDIR"
+        ) from error
     if finished.returncode != 0:
         printed = " ".join(finished.stderr.decode(errors="replace").split())[-300:]
         rmw = rmw_of(env)

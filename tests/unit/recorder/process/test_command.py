@@ -1,6 +1,7 @@
 """`ros2 bag record`: its installation, its command line, and what it says."""
 
 import re
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,17 @@ def test_an_rmw_that_is_not_installed_is_named_with_its_package(
     with pytest.raises(RecorderError, match="status 102") as told:
         find_installation((), tmp_path)
     assert "install the package ros-$ROS_DISTRO-rmw-zenoh-cpp" in str(told.value)
+
+
+def test_where_no_temporary_folder_can_be_made_it_is_said_and_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ros2").write_text("#!/bin/sh\n")
+    (tmp_path / "ros2").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", "/dev/null")
+    with pytest.raises(RecorderError, match="Not a directory; free its disk, or name another"):
+        find_installation((), tmp_path)
 
 
 def test_what_zenoh_and_cyclone_need_is_said_of_them_alone() -> None:
