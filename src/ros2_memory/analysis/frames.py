@@ -518,6 +518,19 @@ def connected_with(frame: str, pairs: Iterable[tuple[str, str]]) -> set[str]:
     return frames
 
 
+def without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
+    """Returns transforms by log time, without those that repeat the one before of their child."""
+    latest: dict[str, StampedTransform] = {}
+    changes: list[StampedTransform] = []
+    for transform in sorted(static, key=lambda transform: transform.log_time):
+        child = transform.child.lstrip("/")
+        last = latest.get(child)
+        if last is None or (last.parent, last.transform) != (transform.parent, transform.transform):
+            latest[child] = transform
+            changes.append(transform)
+    return changes
+
+
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
     """Returns the static transform of each child that is valid at a log time.
 

@@ -10,11 +10,17 @@ import numpy as np
 
 from ros2_memory.core.arrays import Floats, Vectors, joined_codes, stable_order
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.frames import Edges, FrameTree
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import IntArray
+
+_STEP_NS: Final[Ns] = NS_PER_S // 20
+"""The least time between two poses by transforms."""
 
 
 class FrameCodes(NamedTuple):
@@ -109,3 +115,39 @@ def headings(turns: Vectors) -> Floats:
     sums = 2 * np.arctan2(z, w)
     sums -= math.tau * np.rint(sums / math.tau)
     return np.where(np.abs(sine) > GIMBAL_LOCK_SINE, sums, yaws)
+
+
+def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow) -> Poses:
+    """Returns the pose of a body in the target of `frames` at each of its transforms in a window.
+
+    Left out are moments at which no transforms lead to the target.
+    """
+    of_body = [edge for (_, name), edge in edges.items() if name == child]
+    if not of_body:
+        return NO_POSES
+    times = np.concatenate([edge.log_times for edge in of_body])
+    stamps = np.concatenate([edge.stamps for edge in of_body])
+    order = np.argsort(times, kind="stable")
+    first, end = np.searchsorted(times[order], (window.start, window.stop)).tolist()
+    order = order[first:end]
+    placed = frames.poses(child, (stamps if frames.clock == "stamp" else times)[order])
+    if placed is None:
+        return NO_POSES
+    poses = Poses(
+        times[order],
+        np.stack(placed.translation, axis=1),
+        np.stack(placed.rotation, axis=1),
+        FrameCodes(np.zeros(order.size, np.uint32), (frames.target,)),
+        np.full(order.size, np.nan),
+    )
+    return poses.rows(np.flatnonzero(placed.valid))
+
+
+def positions_apart(times: IntArray) -> IntArray:
+    """Returns the positions of ascending times (ns) that are at least `_STEP_NS` apart."""
+    last, positions = MIN_NS, list[int]()
+    for position, time in enumerate(times.tolist()):
+        if time - last >= _STEP_NS:
+            last = time
+            positions.append(position)
+    return np.array(positions, np.int64)

@@ -12,14 +12,20 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Edges, FrameTree, joined_edges
+from ros2_memory.analysis.frames import joined_edges
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
     PathSlice,
     joined_slices,
     path_slice,
 )
-from ros2_memory.analysis.poses import NO_POSES, FrameCodes, Poses, joined_poses
+from ros2_memory.analysis.poses import (
+    NO_POSES,
+    Poses,
+    joined_poses,
+    placed_body,
+    positions_apart,
+)
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
 from ros2_memory.columns.poses import rounded
@@ -36,7 +42,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_HOUR, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
@@ -73,7 +79,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import FrameEdge
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
 
 T = TypeVar("T", bound="Sized")
 
@@ -83,8 +88,6 @@ _BODIES: Final = ("base_footprint", "base_link", "base", "body")
 """Names of the frame of the robot's body, the likelier first."""
 _LONGEST_H: Final = 64
 """In a bag that spans more hours a clock was set: decades may lie between two messages."""
-_STEP_NS: Final = NS_PER_S // 20
-"""The least time between two poses by transforms."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a view: by topic of poses, the frame of its newest pose."""
 
@@ -614,39 +617,3 @@ def poses_by_session(view: View, window: TimeWindow, session: Session) -> Poses:
         edges, body.child, frames_over(view, session, window, body.odometry), window
     )
     return replace(poses, positions=rounded(poses.positions, METRES))
-
-
-def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow) -> Poses:
-    """Returns the pose of a body in the target of `frames` at each of its transforms in a window.
-
-    Left out are moments at which no transforms lead to the target.
-    """
-    of_body = [edge for (_, name), edge in edges.items() if name == child]
-    if not of_body:
-        return NO_POSES
-    times = np.concatenate([edge.log_times for edge in of_body])
-    stamps = np.concatenate([edge.stamps for edge in of_body])
-    order = np.argsort(times, kind="stable")
-    first, end = np.searchsorted(times[order], (window.start, window.stop)).tolist()
-    order = order[first:end]
-    placed = frames.poses(child, (stamps if frames.clock == "stamp" else times)[order])
-    if placed is None:
-        return NO_POSES
-    poses = Poses(
-        times[order],
-        np.stack(placed.translation, axis=1),
-        np.stack(placed.rotation, axis=1),
-        FrameCodes(np.zeros(order.size, np.uint32), (frames.target,)),
-        np.full(order.size, np.nan),
-    )
-    return poses.rows(np.flatnonzero(placed.valid))
-
-
-def positions_apart(times: IntArray) -> IntArray:
-    """Returns the positions of ascending times (ns) that are at least `_STEP_NS` apart."""
-    last, positions = MIN_NS, list[int]()
-    for position, time in enumerate(times.tolist()):
-        if time - last >= _STEP_NS:
-            last = time
-            positions.append(position)
-    return np.array(positions, np.int64)

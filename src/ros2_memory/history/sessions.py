@@ -21,7 +21,7 @@ from weakref import proxy
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge
+from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge, without_repeats
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.columns.fragments import FragmentKey
@@ -383,7 +383,7 @@ class Sessions:
                 self._looked_up += 1
                 if session not in known:
                     received = (self._static_received(each, session) for each in view.static_topics)
-                    known[session] = _without_repeats(chain.from_iterable(received))
+                    known[session] = without_repeats(chain.from_iterable(received))
             if reading.is_final:  # else a note has to be in each answer
                 size = 300 * len(known) + 500 * sum(map(len, known.values()))
                 cache.put(view.static_topics, (view.timeline, known), size)
@@ -402,7 +402,7 @@ class Sessions:
             received[self.session_of(view.bag_dir / statics.recording)] += statics.transforms
         for recording in {bag.recording for bag in coverage.missing}:
             received.pop(self.session_of(recording), None)
-        return {session: _without_repeats(statics) for session, statics in received.items()}
+        return {session: without_repeats(statics) for session, statics in received.items()}
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
         """Yields the static transforms of stored parts that begin in a window."""
@@ -431,7 +431,7 @@ class Sessions:
         def make() -> Statics:
             times = static_times(rows.table, rows.times, rows.index)
             new = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
-            changes = _without_repeats(self.received(None, new))
+            changes = without_repeats(self.received(None, new))
             return Statics(relative(str(rows.recording), str(self._view.bag_dir)), tuple(changes))
 
         key = None if rows.part is None else FragmentKey(rows.first, "", (rows.part,))
@@ -547,19 +547,6 @@ def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterato
                 view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
                 continue
         yield from transforms
-
-
-def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
-    """Returns transforms by log time, without those that repeat the one before of their child."""
-    latest: dict[str, StampedTransform] = {}
-    changes: list[StampedTransform] = []
-    for transform in sorted(static, key=lambda transform: transform.log_time):
-        child = transform.child.lstrip("/")
-        last = latest.get(child)
-        if last is None or (last.parent, last.transform) != (transform.parent, transform.transform):
-            latest[child] = transform
-            changes.append(transform)
-    return changes
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:

@@ -32,7 +32,7 @@ from ros2_memory.analysis.motion.robot_track import (
 )
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
-from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
+from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses, positions_apart
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
@@ -44,7 +44,6 @@ from ros2_memory.history.detections import DetectionRows
 from ros2_memory.history.driven_path import (
     body_by_transforms,
     poses_by_session,
-    positions_apart,
     resolve_path_topic,
 )
 from ros2_memory.history.poses import PoseReader

@@ -30,7 +30,7 @@ from ros2_memory.analysis.motion.robot_track import (
     partial_track,
     track_by,
 )
-from ros2_memory.analysis.poses import Poses, headings
+from ros2_memory.analysis.poses import Poses, headings, placed_body
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.steps import QUATERNION
@@ -48,7 +48,6 @@ from ros2_memory.history.driven_path import (
     body_by_transforms,
     frame_of_newest_pose,
     note_left_out,
-    placed_body,
 )
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
