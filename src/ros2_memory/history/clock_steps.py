@@ -228,7 +228,7 @@ def _poses_of_recordings(
     view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
 ) -> Poses:
     """Returns the poses of some recordings in a window, without invalid positions."""
-    blocks = pose_rows(view, topic, window, [], among=recordings.__contains__)
+    blocks = pose_rows(view, topic, window, among=recordings.__contains__)
     try:
         poses = joined_poses([rows.poses for rows in blocks])
     except InvalidArgumentsError:

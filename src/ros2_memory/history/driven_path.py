@@ -131,7 +131,7 @@ def slices_of_path(
     view: View,
     topic: str,
     window: TimeWindow,
-    failures: list[UndecodableError],
+    failures: list[UndecodableError] | None = None,
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
     fastest = view.limits.max_plausible_speed_mps
@@ -153,7 +153,7 @@ def slices_by_poses(
     kind: FragmentKind[T],
     make: Callable[[PoseSlice], T],
     *,
-    failures: list[UndecodableError],
+    failures: list[UndecodableError] | None = None,
     beside: Ns = 0,
     settings: str = "",
 ) -> Iterator[tuple[Ns, T]]:
@@ -169,7 +169,7 @@ def slices_by_poses(
         window: of log time.
         kind: the kind of what is made, for the store.
         make: makes it.
-        failures: as for `pose_rows`.
+        failures: messages that cannot be decoded are added to it.
         beside: how far before and after a slice (ns) `make` sees poses, too.
         settings: what the result depends on besides the poses.
 
@@ -184,7 +184,7 @@ def slices_by_poses(
     # Stored results are of whole parts, including the parts that the window cuts.
     reach = window.widened(2 * PART_NS) if view.call.stored else window
     opened = open_scan(view, topic, reach, stored=view.call.stored)
-    reader = PoseReader(view, failures, parallel)
+    reader = PoseReader(view, parallel, failures)
 
     def make_slices(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
         rows = opened.rows(newest_first=True, among=stretch.window.widened(beside))

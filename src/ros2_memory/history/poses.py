@@ -87,7 +87,6 @@ def pose_rows(
     view: View,
     topic: str,
     window: TimeWindow,
-    failures: list[UndecodableError],
     *,
     among: Callable[[Path], bool],
 ) -> Iterator[PoseRows]:
@@ -99,10 +98,9 @@ def pose_rows(
         view: of the call.
         topic: of the poses.
         window: of log time.
-        failures: when poses are read, messages that cannot be decoded are added to it.
         among: returns whether a recording counts.
     """
-    reader = PoseReader(view, failures)
+    reader = PoseReader(view)
     counting = (rows for rows in scan(view, topic, window) if among(rows.recording))
     for together in blocks(counting, newest_first=False):
         yield reader.block(together)
@@ -113,19 +111,19 @@ class PoseReader:
 
     Args:
         view: of the call.
-        failures: messages that cannot be decoded are added to it.
         parallel: recordings with different poses at the same time: then the `other` one of a pair
             does not count.
+        failures: the list to which messages that cannot be decoded are added; None for an own one.
     """
 
     def __init__(
         self,
         view: View,
-        failures: list[UndecodableError],
         parallel: Sequence[ParallelRecordings] = (),
+        failures: list[UndecodableError] | None = None,
     ) -> None:
         self._view = view
-        self._failures = failures
+        self.failures: list[UndecodableError] = [] if failures is None else failures
         self._parallel = parallel
         self._columns = PoseColumns(view.extractor)
 
@@ -196,7 +194,7 @@ class PoseReader:
         poses: list[Pose] = []
         speeds: list[float] = []
         for stored in messages_of(self._view, rows):
-            message = self._view.bags.decode(stored, self._failures)
+            message = self._view.bags.decode(stored, self.failures)
             if message is None:
                 continue
             pose = extractor.pose(message, stored.type)

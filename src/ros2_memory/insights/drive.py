@@ -215,7 +215,7 @@ def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tu
     def make(part: PoseSlice) -> Stands:
         return stands_of(part.poses, part.start, part.stop)
 
-    return slices_by_poses(view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS)
+    return slices_by_poses(view, topic, window, STANDS, make, beside=BESIDE_NS)
 
 
 def make_drive_slices(view: View, window: TimeWindow) -> Iterator[Ns]:
@@ -225,6 +225,6 @@ def make_drive_slices(view: View, window: TimeWindow) -> Iterator[Ns]:
     """
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)
-        path = slices_of_path(view, topic, window.widened(SLICE_NS), [])
+        path = slices_of_path(view, topic, window.widened(SLICE_NS))
         stands = _stands_of_slices(view, topic, window.widened(SLICE_NS + BESIDE_NS))
         yield from merge((at for at, _ in path), (at for at, _ in stands), reverse=True)

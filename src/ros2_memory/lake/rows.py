@@ -566,7 +566,7 @@ def _poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> 
         tables: all rows of a topic, of these and other bags.
         files: the paths of the bags.
     """
-    reader = PoseReader(view, [])
+    reader = PoseReader(view)
     parts: dict[str, list[Poses]] = defaultdict(list)
     for rows in tables:
         poses = reader.poses_of_all(rows)

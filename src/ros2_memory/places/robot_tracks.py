@@ -37,7 +37,7 @@ from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.arrays import Flags, Ints, stable_order
-from ros2_memory.core.errors import QueryTimeoutError, UndecodableError, to_report
+from ros2_memory.core.errors import QueryTimeoutError, to_report
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
@@ -103,8 +103,7 @@ class TrackReader:
             frame_of_newest_pose(view, view.pose_topic) if body is None else body.child
         )
         self._is_own = body is None and self._own_frame == frame_id
-        self._failures: list[UndecodableError] = []
-        self._reader = PoseReader(view, self._failures)
+        self._reader = PoseReader(view)
 
     def track_in(self, window: TimeWindow) -> KnownTrack:
         """Returns the track in a window, and a little beyond it.
@@ -127,8 +126,8 @@ class TrackReader:
                 f"the question needs more time; {view.bags.filling_progress()}"
                 "ask about a shorter window"
             ) from error
-        if self._failures:
-            note_left_out(view, to_report(self._failures))
+        if self._reader.failures:
+            note_left_out(view, to_report(self._reader.failures))
         left_out = sum(track.left_out for track in tracks)
         track, others = self._tracks_of_robots(tracks, around)
         known[key] = KnownTrack(track, since, left_out, others)

@@ -29,7 +29,7 @@ from ros2_memory.analysis.sights import (
     fixes_of,
     sights_of,
 )
-from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -208,12 +208,10 @@ class Placer:
 
     def _recorded_poses(self, session: Session, window: TimeWindow) -> Poses:
         """Returns the poses of the robot's topic in a session and a window."""
-        failures: list[UndecodableError] = []
         units = pose_rows(
             self._view,
             self._view.pose_topic,
             window,
-            failures,
             among=lambda recording: self._sessions.session_of(recording) == session,
         )
         try:
