@@ -41,7 +41,7 @@ def environment(scratch: Path) -> dict[str, str]:
 def demonstrating(scratch: Path, *options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A demo that goes on, and the address that it invites to; none is left running."""
     with subprocess.Popen(
-        [*PROGRAM, "--port", "0", "--duration", "95", *options],
+        [*PROGRAM, "--port", "0", *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -93,7 +93,7 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     position = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
     falsified = replace(position, arguments={"seconds_ago": 20})
     output: list[str] = []
-    code = run_demo(output.append, [position, falsified], once=True, port=0, duration_s=95.0)
+    code = run_demo(output.append, [position, falsified], once=True, port=0)
     assert code == 1
     assert "WRONG: expected a time 10 s ago" in output[-2]
     assert output[-1] == "1 of 2 answers are right."
@@ -128,7 +128,7 @@ def test_its_server_ends_with_it_where_it_is_killed(scratch: Path) -> None:
 def test_a_port_in_use_is_named_and_nothing_stays(scratch: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        refused = ended(scratch, "--port", str(port), "--duration", "95")
+        refused = ended(scratch, "--port", str(port))
     assert refused.returncode == 2
     assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
     assert list(scratch.iterdir()) == []

@@ -243,8 +243,6 @@ def demo(
     *,
     port: Annotated[int, "Port on 127.0.0.1; 0 picks a free one."] = 9203,
     bag_dir: Annotated[Path | None, "DIR", "Keep the bags in this new or empty folder."] = None,
-    duration: Annotated[float, "S", "Seconds to record before the questions."] = 120.0,
-    verbose: Annotated[bool, "Show the server's log on stderr."] = False,
     as_json: Annotated[bool, "--json", "Print a line of JSON for each question."] = False,
 ) -> int:
     """Simulate a robot, record it, and ask the server questions about it.
@@ -257,12 +255,4 @@ def demo(
 
     # A proxy that the environment names would not reach the server, which is on this machine.
     os.environ["no_proxy"] = HOST
-    return run_demo(
-        print_line,
-        once=once,
-        port=port,
-        bag_dir=bag_dir,
-        duration_s=duration,
-        verbose=verbose,
-        as_json=as_json,
-    )
+    return run_demo(print_line, once=once, port=port, bag_dir=bag_dir, as_json=as_json)

@@ -27,7 +27,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, WallClock, ns_from_unix
 from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.questions import QUESTIONS, CallContext, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.demo.robot import LAP_S, ROOMS
+from ros2_memory.demo.robot import ROOMS
 from ros2_memory.recorder.process.child import Child, end_all
 
 if TYPE_CHECKING:
@@ -130,12 +130,11 @@ def server_environment(
 
 
 @contextmanager
-def running_server(bag_dir: Path, port: int, *, verbose: bool) -> Iterator[tuple[Child, str]]:
+def running_server(bag_dir: Path, port: int) -> Iterator[tuple[Child, str]]:
     """Starts a server, yields it with its address when it answers, and ends it after the block.
 
-    Writes the rooms of the flat to `places.yaml` in the bag directory. The server's log goes to
-    stderr if `verbose`, its columns into a temporary folder. The server also ends if this program
-    is killed.
+    Writes the rooms of the flat to `places.yaml` in the bag directory. The server's columns go into
+    a temporary folder. The server also ends if this program is killed.
 
     Raises:
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
@@ -149,7 +148,7 @@ def running_server(bag_dir: Path, port: int, *, verbose: bool) -> Iterator[tuple
         server = Child.start(
             [sys.executable, "-P", "-m", "ros2_memory.server", "--page", "print"],
             server_environment(os.environ, bag_dir, port, cache),
-            stderr=None if verbose else subprocess.STDOUT,
+            stderr=subprocess.STDOUT,
         )
         try:
             yield server, _wait_for_address(server)
@@ -179,8 +178,8 @@ def _wait_for_address(server: Child) -> str:
 
 
 SPLIT_DURATION_S: Final = 5.0
-SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
-LONGEST_S: Final = 86_400.0
+HISTORY_S: Final = 120.0
+"""The length of the history when the questions are asked: more than a lap of the robot."""
 _UNDERWAY_S: Final = 22
 """Seconds that the robot has been driving when its recording begins: it leaves the front door."""
 
@@ -194,8 +193,6 @@ def run_demo(
     once: bool = False,
     port: int = 9203,
     bag_dir: Path | None = None,
-    duration_s: float = 120.0,
-    verbose: bool = False,
     as_json: bool = False,
 ) -> int:
     """Records, serves, asks, and then continues until it is interrupted.
@@ -206,8 +203,6 @@ def run_demo(
         once: whether to leave after the answers.
         port: the server's; 0 for any free one.
         bag_dir: an empty or new folder for the bags; None for a temporary one.
-        duration_s: the length of the history when the questions are asked.
-        verbose: whether the server's log goes to stderr.
         as_json: whether to print only a line of JSON for each question.
 
     Returns:
@@ -219,11 +214,6 @@ def run_demo(
         KeyboardInterrupt: it was interrupted before all answers were there.
         OSError: the folder cannot be made or written.
     """
-    if not SHORTEST_S <= duration_s <= LONGEST_S:
-        raise ConfigError(
-            f"--duration {duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
-            "the shortest is a lap of the robot and two bag files"
-        )
     if bag_dir and bag_dir.exists() and (not bag_dir.is_dir() or any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
 
@@ -240,19 +230,19 @@ def run_demo(
             bag_dir = Path(stack.enter_context(temporary))
         bag_dir.mkdir(parents=True, exist_ok=True)
         folder = bag_dir.resolve()
-        begun = WallClock().now() - ns_from_unix(duration_s)
+        begun = WallClock().now() - ns_from_unix(HISTORY_S)
         schedule = MessageSchedule(t0=begun - _UNDERWAY_S * NS_PER_S, start=begun)
         name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
         recorder = DemoRecorder(folder / name, schedule, split_duration_s=SPLIT_DURATION_S)
         if recorder.failure is not None:
             raise recorder.failure
         stack.enter_context(recorder)
-        server, url = stack.enter_context(running_server(folder, port, verbose=verbose))
+        server, url = stack.enter_context(running_server(folder, port))
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
             "real\nquery server about it, and each answer is held against the robot's closed form."
             f"\n\n  bags     {recorder.directory}\n"
-            f"           {duration_s:g} s of history in {recorder.splits} files of "
+            f"           {HISTORY_S:g} s of history in {recorder.splits} files of "
             f"{SPLIT_DURATION_S:g} s, the last one being written\n"
             f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
         )
