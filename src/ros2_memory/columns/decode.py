@@ -28,6 +28,7 @@ from ros2_memory.columns.plan import (
     plan_of,
 )
 from ros2_memory.columns.table import (
+    MAX_NUMBERS,
     MAX_RANGED_BYTES,
     UNHASHED,
     Numbers,
@@ -122,6 +123,7 @@ def undecoded(
     columns: bool = True,
     skip_undecodable: bool = False,
     number: int = 0,
+    most_numbers: int = MAX_NUMBERS,
 ) -> Iterator[Group]:
     """Yields the messages of a bag in groups, for `Group.tables`.
 
@@ -142,6 +144,7 @@ def undecoded(
         skip_undecodable: whether messages that cannot be decoded are left out. If not, one of them
             leaves its topic without columns in this group.
         number: the number of the bag in the tables.
+        most_numbers: the longest sequences of numbers that have elements.
 
     Raises:
         BagVanishedError: the file is not there.
@@ -154,7 +157,7 @@ def undecoded(
         if topics is not None:
             channels = [channel for channel in channels if channel.topic in topics]
         wanted = {channel.topic for channel in channels}
-        kinds = _Kinds(reader, hashed, columns)
+        kinds = _Kinds(reader, hashed, columns, most_numbers)
         kinds.find_bulky(channels, path, window)
         bare = wanted - kinds.topics_with_payload(channels, reader.times_alone(path))
         group = Group(reader, skip_undecodable)
@@ -183,6 +186,7 @@ class _Kinds:
     reader: BagReader
     hashed: Callable[[Channel], bool]
     columns: bool
+    most_numbers: int
     _buffer: bytes = b""
     _read_bytes: int = 0
     _firsts: dict[tuple[Schema, str, str], Channel] = field(default_factory=dict)
@@ -257,7 +261,7 @@ class _Kinds:
         if definition.type in BULKY_TYPES:
             return None, _BULKY
         try:
-            return plan_of(definition), ""
+            return plan_of(definition, self.most_numbers), ""
         except UnplannedError as error:
             return None, str(error)
 
@@ -534,7 +538,7 @@ def _level_of(plan: Plan, messages: Sequence[object]) -> LevelColumns:
             counts = np.array([array.size for array in arrays], np.int64)
             looked_at = [array for array in arrays if array.size * step.size <= MAX_RANGED_BYTES]
             numbers = np.concatenate([np.zeros(0, step.dtype), *looked_at]).astype(step.dtype)
-            add_sequence(level, step.path, counts, numbers, is_bool=step.is_bool)
+            add_sequence(level, step, counts, numbers)
         else:
             lists = [value if isinstance(value, list) else [] for value in values]
             inner = _level_of(step.plan, [*chain.from_iterable(lists)])

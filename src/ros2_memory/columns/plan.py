@@ -121,7 +121,7 @@ class Text(NamedTuple):
 
 
 class NumberSequence(NamedTuple):
-    """A sequence of numbers, each of `size` bytes."""
+    """A sequence of numbers, each of `size` bytes; one of at most `most` has them as elements."""
 
     align: int
     skip: int
@@ -130,6 +130,7 @@ class NumberSequence(NamedTuple):
     dtype: np.dtype[np.generic[object]]
     is_bool: bool
     size: int
+    most: int
 
 
 class Sequence(NamedTuple):
@@ -171,14 +172,14 @@ class Plan:
 
 
 @lru_cache(512)
-def plan_of(definition: Definition) -> Plan:
-    """Returns the plan of a type.
+def plan_of(definition: Definition, most_numbers: int = MAX_NUMBERS) -> Plan:
+    """Returns the plan of a type. Sequences of at most `most_numbers` numbers have elements.
 
     Raises:
         UnplannedError: it has more columns than `MAX_COLUMNS`, a field of a type that cannot become
             a column, or an array that is too long for any message.
     """
-    planner = _Planner(iter(range(MAX_COLUMNS)))
+    planner = _Planner(iter(range(MAX_COLUMNS)), most_numbers)
     planner.add_message(definition, "", "")
     return planner.plan()
 
@@ -192,6 +193,7 @@ class _Planner:
 
     # Columns that may still be added; planners of elements take from the same iterator.
     budget: Iterator[int]
+    most_numbers: int
     steps: list[Step] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     unit: int = 8
@@ -266,7 +268,10 @@ class _Planner:
         dtype = _dtype(kind)
         align, skip = self._begin_variable()
         self.steps.append(
-            NumberSequence(align, skip, path, attribute, dtype, kind == "bool", dtype.itemsize)
+            NumberSequence(
+                *(align, skip, path, attribute, dtype, kind == "bool", dtype.itemsize),
+                self.most_numbers,
+            )
         )
         self._pass_variable(min(4, dtype.itemsize), 4)
 
@@ -291,7 +296,7 @@ class _Planner:
 
     def _elements(self, kind: str | Definition, length: int, path: str, attribute: str) -> None:
         first = first_align(kind)
-        planner = _Planner(self.budget, unit=first)
+        planner = _Planner(self.budget, self.most_numbers, unit=first)
         if isinstance(kind, Definition) and not is_time(kind):
             planner.add_message(kind, "", "")
         else:

@@ -10,8 +10,9 @@ topic, type and definition can be joined:
 - a longer fixed array: `<path>.length` and, up to `MAX_RANGED_BYTES`, `<path>.least` and
   `<path>.greatest`;
 - a sequence of numbers: `<path>.length`, `<path>.least`, `<path>.greatest`, and `Elements` with the
-  column "" that hold the numbers of those rows that have at most `MAX_NUMBERS`; of rows that have
-  more there are no elements (`left_out` then names the path);
+  column "" that hold the numbers of those rows that have at most `MAX_NUMBERS`, or, decoded for a
+  question, `MOST_DECODED_NUMBERS`; of rows that have more there are no elements (`left_out` then
+  names the path);
 - a sequence or an array of messages: `Elements` with the columns of the message; of strings, times
   and durations: `Elements` with the column "".
 
@@ -42,6 +43,9 @@ Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
 MAX_NUMBERS: Final = 9
 """Longer arrays of numbers (covariances of poses, scans, images) are no columns."""
+MOST_DECODED_NUMBERS: Final = 64
+"""Sequences of numbers (of a robot's joints) up to this length have elements where a bag is decoded
+for a question."""
 IN_PART: Final = "LETTERS"
 """Begins the words of a zone that has the runs of letters in its texts, not the whole texts.
 

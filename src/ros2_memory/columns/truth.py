@@ -26,7 +26,7 @@ from ros2_memory.analysis.conditions import (
 from ros2_memory.columns.detections import may_be_json, without_low
 from ros2_memory.columns.shown import NOTHING, ByType, Listing, Node, Shape, at_field, leaves_of
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.columns.table import MAX_NUMBERS, as_float
+from ros2_memory.columns.table import as_float
 from ros2_memory.columns.values import (
     ROWS,
     Kind,
@@ -395,13 +395,13 @@ class _LeafTest(NamedTuple):
         Args:
             values: of the table.
             level: of the arrays.
-            has_short: whether short arrays have a column; else all count as long.
+            has_short: whether short arrays have elements; else all count as long.
         """
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
         if lengths is None:
             raise UnknownShapeError(f"{path}.length has no column")
-        is_long = lengths > (MAX_NUMBERS if has_short else 0)
+        is_long = lengths > (values.counts(self.leaf.level) if has_short else 0)
         if not is_long.any():
             return
         least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))

@@ -182,6 +182,12 @@ class Values:
             raise UnknownShapeError(f"{level.name} has no columns")
         return elements
 
+    def counts(self, level: Level) -> IntArray:
+        """Returns how many elements each row, or each element around it, has; raises as above."""
+        around = level.parent
+        rows = self.rows if around is None else self.size(around)
+        return np.bincount(self.elements(level).owners, minlength=rows)
+
     def size(self, level: Level) -> int:
         """Returns how many rows or elements a level has; raises as `elements`."""
         return self.rows if level.parent is None else len(self.elements(level))
@@ -270,7 +276,9 @@ class Values:
         if not leaf.is_of_array or leaf.level.parent is None:
             return True
         lengths = self.numeric(leaf.level.parent, f"{leaf.level.name}.length")
-        return lengths is not None and not (lengths > MAX_NUMBERS).any()
+        if lengths is None or self._rows(leaf.level) is None:
+            return False
+        return not (lengths > self.counts(leaf.level)).any()
 
     def error(self, leaf: Leaf) -> float:
         """Returns the greatest error of the columns of a leaf, in their own unit."""

@@ -15,7 +15,6 @@ import numpy as np
 
 from ros2_memory.columns.plan import Array, NumberSequence, Plan, Run, Sequence, Text, Time
 from ros2_memory.columns.table import (
-    MAX_NUMBERS,
     MAX_RANGED_BYTES,
     Column,
     Elements,
@@ -229,7 +228,7 @@ class _Walk:
             raise NotWalkedError
         if level is not None:
             values = self._values(step, rows.origins + begin, counts)
-            add_sequence(level, step.path, counts, values, is_bool=step.is_bool)
+            add_sequence(level, step, counts, values)
         return end
 
     def _values(self, step: NumberSequence, places: IntArray, counts: IntArray) -> Numbers:
@@ -311,28 +310,28 @@ def _locate_fixed(
 
 
 def add_sequence(
-    level: LevelColumns, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
+    level: LevelColumns, step: NumberSequence, counts: IntArray, values: Numbers
 ) -> None:
     """Adds the columns of a sequence of numbers: lengths, ranges and short arrays.
 
     Args:
         level: gets the columns.
-        path: of the sequence.
+        step: of the sequence.
         counts: how many numbers each row has.
         values: the numbers of the rows that take at most `MAX_RANGED_BYTES`, in order.
-        is_bool: whether they are booleans.
     """
+    path, is_bool = step.path, step.is_bool
     if is_bool:
         values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
     is_ranged = counts * values.itemsize <= MAX_RANGED_BYTES
     add_ranges(level.columns, path, counts, np.where(is_ranged, counts, 0), values)
-    is_short = counts <= MAX_NUMBERS
+    is_short = counts <= step.most
     is_of_short = np.repeat(is_short[is_ranged], counts[is_ranged])
     numbers = values if is_of_short.all() else values[is_of_short]
     owners = np.repeat(np.arange(counts.size), np.where(is_short, counts, 0))
     level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
     if not is_short.all():
-        level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
+        level.left_out[path] = f"more than {step.most} numbers in some messages"
 
 
 def add_array(columns: dict[str, Column], entry: Array, rows: int, values: Numbers | None) -> None:

@@ -11,6 +11,7 @@ from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.scanner import DECODED_BYTES
+from ros2_memory.columns.table import MOST_DECODED_NUMBERS
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
@@ -289,6 +290,7 @@ class BagAccess:
                 topics=[topic],
                 hashed=lambda channel: hashed or channel.latched,
                 columns=columns,
+                most_numbers=MOST_DECODED_NUMBERS,
             )
             groups = map(Group.tables, read_now)
         else:

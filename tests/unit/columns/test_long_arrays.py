@@ -21,8 +21,10 @@ from tests.support.bags import (
     quaternion,
     stamp,
     typestore,
+    write_mcap,
 )
-from tests.support.memories import asked, each_way, remembered, with_store
+from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.noting_reader import NotingReader
 
 T0 = 1_790_000_000 * NS_PER_S
 
@@ -240,3 +242,20 @@ def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path
         assert reply["extremes"]["position.elbow"]["max"] == 0.4
         by_hour = asked(memory, "get_topic_in_range", fields=["position.elbow"], by="hour", **given)
         assert by_hour["all"][by_hour["columns"].index("position.elbow.max") - 1] == 0.4
+
+
+def test_joints_of_a_robot_with_many_are_compared_without_reading_each_message(
+    tmp_path: Path,
+) -> None:
+    """The range of all its joints says nothing of one, and the store has no column of each."""
+    names = ["elbow", *map("joint_{}".format, range(15))]
+    angles = [0.9 if nth < 120 else 0.1 for nth in range(200)]
+    messages = [joint_state(nth, names, [angle, *[2.0] * 15]) for nth, angle in enumerate(angles)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    reader = NotingReader()
+    memory = memory_of(tmp_path, reader=reader, recalls=True)
+    reader.read.clear()
+    bent = {"topic": "/joints", "condition_type": "above", "field": "positions.elbow", "value": 0.5}
+    [sighting] = asked(memory, "find_matches", **bent)["sightings"]
+    assert (sighting["count"], sighting["duration_s"]) == (120, 120.0)
+    assert len(reader.read) < 20
