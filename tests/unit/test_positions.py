@@ -427,6 +427,13 @@ def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool
     assert refused["detail"].endswith("places base_link")
 
 
+def test_odometry_is_that_of_the_robot_whatever_it_is_called(tmp_path: Path) -> None:
+    """The name of a goalkeeper contains "goal"; poses of goals are not the robot's."""
+    poses = [odom(T0 + n * S // 10, n / 10, topic="/goalkeeper/odom") for n in range(100)]
+    memory = remembered(tmp_path, [*poses, *moved(range(100))])
+    assert asked(memory, "get_position_at", timestamp=T0_S + 5)["topic"] == "/goalkeeper/odom"
+
+
 def test_what_placed_the_robot_before_its_poses_were_recorded_is_named(tmp_path: Path) -> None:
     """Odometry was taken into the list after ten seconds: before, transforms placed the robot."""
     odometry = [odom(T0 + n * S // 10, n / 10) for n in range(100, 200)]

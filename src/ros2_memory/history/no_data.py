@@ -107,7 +107,11 @@ def topics_of_robot(view: View, what: str) -> list[str]:
 
     `what` is as in `topics_with`.
     """
-    return [topic for topic in _types_with(view, what) if not _OF_OTHERS.search(topic)]
+    return [
+        topic
+        for topic in _types_with(view, what)
+        if topic.endswith(_DEFAULT_POSES) or not _OF_OTHERS.search(topic)
+    ]
 
 
 def resolve_pose_topic(
