@@ -258,7 +258,7 @@ class Triggers:
 
     def _previous(self, recording: str) -> str | None:
         handover = read_handover(self.bag_dir / recording).handover
-        return handover.previous if handover.state is Counting.COUNTS else None
+        return None if handover.state is Counting.PENDING else handover.previous
 
     def _add_firing(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
         """Counts a firing, and joins it to the newest moment of its rule or begins another."""

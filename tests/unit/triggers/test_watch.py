@@ -9,11 +9,14 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.bag_dir.handover_file import Counting, Handover, message_id, write_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS, TriggerState
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import BagUnreachableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.rules import Rule
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.fakes import broken
@@ -103,6 +106,28 @@ def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> No
         robot.look()
     robot.close_all()
     assert robot.record().fired == 1
+
+
+def test_a_handover_that_was_given_up_ends_no_match(tmp_path: Path) -> None:
+    """The recording that did not take over has a message that the other one missed."""
+    robot = watched(tmp_path, rule(hold=30 * S))
+    old = robot.begin(T0)
+    robot.split([flag(n, value=True) for n in range(50) if n != 45])
+    robot.look()
+    robot.begin(T0 + 44 * S)
+    path = robot.split([flag(45, value=True)])
+    [missed] = McapReader().records(path, ["/bumper"], TimeWindow.everything())
+    also = {path.name: {"/bumper": (message_id(missed.publish_time, missed.payload),)}}
+    given_up = Handover(Counting.VOID, previous=old, compared=True, also_counts=also)
+    write_handover(path.parent, given_up)
+    robot.beat(old)
+    robot.look()
+    for nth in (1, 2, 3, 4):
+        at = 20 + 30 * nth
+        robot.split(seconds(at, at + 30, range(at, at + 30)), old)
+        robot.look()
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 30 * S]
 
 
 def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silence(
