@@ -159,10 +159,9 @@ def reply(fleet: Fleet, tool: str, given: Mapping[str, object], call: Call | Non
 def reply_of(tool: Tool, given: Mapping[str, object], call: Call | None = None) -> Any:
     """The JSON of a tool of a fleet, be it an error."""
     replies = Replies(Path("nowhere"), MOST_CHARS)
-    # The memory is that of no robot.
-    none: Any = None
+    of_no_robot = memory_of(Path("/nowhere"))
     try:
-        answer = replies.answer(tool.question({**given})(none, call or Call()))
+        answer = replies.answer(tool.question({**given})(of_no_robot, call or Call()))
     except EpisodicError as error:
         answer = replies.error(error)
     return json.loads(answer.text)
