@@ -26,7 +26,6 @@ from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
-from ros2_memory.messages.levels import with_level_names
 from ros2_memory.tools.reply_size import to_json_text
 
 Row: TypeAlias = tuple[Ns, JsonValue]
@@ -112,8 +111,7 @@ def extract_values(
             left_out += 1
             continue
         if not exact:
-            shown = extractor.shown(message, stored.type, fields).value
-            yield stored.time, with_level_names(shown, stored.type)
+            yield stored.time, extractor.shown(message, stored.type, fields).value
             continue
         if is_first:  # `exact_at` does not refuse fields that the type lacks
             extractor.shown(message, stored.type, fields)

@@ -19,7 +19,6 @@ from rich.text import Text
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.text import dotted
 from ros2_memory.core.timebase import NS_PER_US, local_time
-from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -101,7 +100,6 @@ def spinner(activity: str) -> Iterator[Callable[[str], None]]:
 
 def print_reply(reply: JsonValue) -> None:
     """Prints a reply for people: a line for each value, a table for each list of objects."""
-    reply = with_level_names(reply)
     if isinstance(reply, dict):
         _print_object(reply)
     elif rows := _objects(reply):

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
 
 FIELD: Final = "level"
 _LOG: Final = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40, "FATAL": 50}
@@ -24,12 +23,6 @@ _BY_TYPE: Final[Mapping[str, Mapping[str, int]]] = {
     "diagnostic_msgs/msg/DiagnosticArray": _STATUS,
     "diagnostic_msgs/msg/DiagnosticStatus": _STATUS,
 }
-_BESIDE: Final = (
-    (frozenset({"msg"}), _LOG),
-    (frozenset({"message", "hardware_id"}), _STATUS),
-    (frozenset({"message", "timestamp"}), _FOXGLOVE),
-)
-"""Levels of messages of unknown type, by the fields beside `level`."""
 
 
 def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonValue:
@@ -78,30 +71,3 @@ def unknown_name_hint(value: JsonValue, field: str | None, types: Collection[str
 def _is_name_of_level(value: JsonValue, field: str | None) -> bool:
     is_name = isinstance(value, str) and value.strip().isalpha()
     return is_name and (field or "").strip().rpartition(".")[2] == FIELD
-
-
-def with_level_names(value: JsonValue, type_name: str | None = None) -> JsonValue:
-    """Returns a value with names beside the numbers of levels, for people: `WARN (30)`.
-
-    `type_name` is the message type; without it the fields beside a level tell its names.
-    """
-    if isinstance(value, list):
-        return [with_level_names(element, type_name) for element in value]
-    if not isinstance(value, dict):
-        return value
-    shown = {key: with_level_names(part, type_name) for key, part in value.items()}
-    number = value.get(FIELD)
-    if isinstance(number, int) and not isinstance(number, bool):
-        levels = _levels_beside(value) if type_name is None else _BY_TYPE.get(type_name, {})
-        for name, level in levels.items():
-            if level == number:
-                shown[FIELD] = f"{name} ({number})"
-    return shown
-
-
-def _levels_beside(value: JsonObject) -> Mapping[str, int]:
-    """Returns the levels of an extracted value by the fields beside `level`; else none."""
-    for fields, levels in _BESIDE:
-        if fields <= value.keys():
-            return levels
-    return {}

@@ -30,7 +30,7 @@ from ros2_memory.columns import database
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, log_entry, odom, text, write_mcap
+from tests.support.bags import Msg, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
@@ -286,15 +286,6 @@ def test_csv_has_a_column_for_each_field(folder: Path, exits: Program) -> None:
     rows = [*csv.reader(exits(0, "cat /odom b", *words).out.splitlines())]
     assert rows[0] == ["time", "position.y", "header.frame_id"]
     assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
-
-
-def test_levels_of_a_log_have_their_names(tmp_path: Path, exits: Program) -> None:
-    lines = [log_entry(T0 + level, level, "nav", "said") for level in (30, 35)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
-    shown = exits(0, f"cat /rosout {tmp_path}").out
-    assert re.findall("level: ([^;]*);", shown) == ["WARN (30)", "35"]
-    shown = exits(0, f"cat /rosout {tmp_path} --field level --limit 1").out
-    assert shown.endswith("level: WARN (30)\n")
 
 
 @pytest.mark.parametrize(
