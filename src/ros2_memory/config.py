@@ -494,7 +494,6 @@ class DuckdbNode(AdapterNode):
 
     target: Literal["ros2_memory.lake.engine.Lake"] = Field(alias="_target_")
     memory_mb: Count
-    threads: Count | None
 
 
 @section

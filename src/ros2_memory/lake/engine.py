@@ -68,7 +68,6 @@ class Lake:
         catalog: the catalogue of the tables.
         translated: turns the errors of catalogues and stores into those of this program.
         memory_mb: how much memory DuckDB may use for a statement.
-        threads: how many threads DuckDB may use; None for one for each core.
 
     Attributes:
         messages: the packed messages that were read last, of all robots.
@@ -78,7 +77,6 @@ class Lake:
     catalog: IcebergCatalog
     translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext()
     memory_mb: int = 1024
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         """Starts with nothing read."""
@@ -165,7 +163,7 @@ class Lake:
             is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
             files = self._files_for(robots, name) if is_named else ()
             tables[name] = self._files_of(name, files)
-        select = Select(sql, self.memory_mb, self.threads, most_rows, most_chars)
+        select = Select(sql, self.memory_mb, most_rows, most_chars)
         left_s = max(0.0, min(deadline.left_s(), threading.TIMEOUT_MAX))
         if not self._turns.acquire(timeout=left_s):
             raise BusyError("other statements were not answered in time; ask again, or fewer")

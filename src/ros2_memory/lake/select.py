@@ -123,14 +123,12 @@ class Select:
     Attributes:
         sql: the statement.
         memory_mb: how much memory DuckDB may use.
-        threads: how many threads DuckDB may use; None for one for each core.
         most_rows: how many rows are returned at most; None for all.
         most_chars: how long the JSON of all rows may be; None for any length.
     """
 
     sql: str
     memory_mb: int
-    threads: int | None = None
     most_rows: int | None = None
     most_chars: int | None = None
 
@@ -175,8 +173,6 @@ class Select:
             EpisodicError: see `run`.
         """
         settings = {**_SETTINGS, "memory_limit": f"{self.memory_mb}MiB", "temp_directory": ""}
-        if self.threads:
-            settings["threads"] = str(self.threads)
         with duckdb.connect(config={**settings}) as connection:
             try:
                 check_select(self.sql, tables, connection)

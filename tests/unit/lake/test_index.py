@@ -35,7 +35,7 @@ class WatchedLake(Lake):
     """Keeps which files were read."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(lake_in(folder), memory_mb=256, threads=1)
+        super().__init__(lake_in(folder), memory_mb=256)
         self.read: set[str] = set()
 
     def rows(self, name: str, files: Iterable[LakeFile], *how: Any) -> pa.Table:

@@ -287,7 +287,7 @@ async def test_a_server_looks_at_what_was_shipped_before_it_is_asked_and_for_lat
 def test_an_engine_has_the_settings_of_its_group_and_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = [*overrides(tmp_path), "lake.engine.memory_mb=64", "lake.engine.threads=1"]
+    given = [*overrides(tmp_path), "lake.engine.memory_mb=64"]
     fleet = build_fleet(load_settings(given, {}))
     assert fleet is not None
     assert fleet.tables is not None

@@ -46,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fleet(folder: Path) -> Fleet:
-    lake = Lake(lake_in(folder / "lake"), memory_mb=256, threads=1)
+    lake = Lake(lake_in(folder / "lake"), memory_mb=256)
     shipped = lake_robots(lake, [HALL, ATTIC])
     robots = [Robot(name, folder / name, memory) for name, memory in shipped.items()]
     robots.append(Robot(UNSHIPPED, folder / UNSHIPPED, memory_of(folder / UNSHIPPED)))
@@ -223,7 +223,7 @@ def test_an_end_that_shows_no_want_of_memory_is_not_called_that(
 def test_its_process_ends_by_itself_should_the_server_be_killed() -> None:
     left_alone = subprocess.run(
         [sys.executable, "-c", "from ros2_memory.lake.select import main; main()"],
-        input=pickle.dumps((Select(ENDLESS, 256, 1), {}, 0.0)),
+        input=pickle.dumps((Select(ENDLESS, 256), {}, 0.0)),
         env={**os.environ, **ALLOCATORS},
         capture_output=True,
         timeout=60,

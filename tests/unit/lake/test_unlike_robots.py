@@ -83,7 +83,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     }
     with location(lake).opened() as catalog:
         of_lake = lake_robots(
-            Lake(catalog, memory_mb=256, threads=1),
+            Lake(catalog, memory_mb=256),
             [*ROBOTS],
             stores=tmp_path_factory.mktemp("cache"),
             now=NOW,
@@ -154,7 +154,7 @@ def joined(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[F
             shutil.copy2(bag, copy)
     ship(half / "rows", [robot_bags(name, half / "lake" / name) for name in names], most_bags=100)
     with location(half / "rows").opened() as catalog:
-        lake = Lake(catalog, memory_mb=256, threads=1)
+        lake = Lake(catalog, memory_mb=256)
         of_lake = lake_robots(lake, names, now=NOW, bag_dirs=half / "own")
         own = {name: memory_of(half / "own" / name, clock=FixedClock(NOW)) for name in names}
         both = {name: joined_memory(of_lake[name], own[name]) for name in names}
