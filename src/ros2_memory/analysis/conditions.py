@@ -476,10 +476,6 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
                 f"'{axis}' of 'near_position' must be a finite number of metres,"
                 f" not {_kind(value.get(axis))}; {example}"
             )
-    if not (math.isfinite(tolerance_m) and tolerance_m >= 0):
-        raise InvalidArgumentsError(
-            f"the tolerance must be a finite number of metres, 0 or more, not {tolerance_m}"
-        )
     frame_id = value.get("frame_id")
     if frame_id is not None and not (isinstance(frame_id, str) and frame_id.strip()):
         raise InvalidArgumentsError(
