@@ -154,7 +154,7 @@ def lake_robots(
 
 def lake_robot(folder: Path, **how: Any) -> Memory:
     """The robot `hall` of the lake in a folder; see `lake_robots`."""
-    lake = Lake(lake_in(folder), memory_mb=256, threads=1)
+    lake = Lake(lake_in(folder), memory_mb=256)
     return lake_robots(lake, ["hall"], **how)["hall"]
 
 

@@ -117,7 +117,9 @@ def test_a_handover_that_was_given_up_ends_no_match(tmp_path: Path) -> None:
     robot.begin(T0 + 44 * S)
     path = robot.split([flag(45, value=True)])
     [missed] = McapReader().records(path, ["/bumper"], TimeWindow.everything())
-    also = {path.name: {"/bumper": (message_id(missed.publish_time, missed.payload),)}}
+    also: dict[str, dict[str, tuple[str, ...]]] = {
+        path.name: {"/bumper": (message_id(missed.publish_time, missed.payload),)}
+    }
     given_up = Handover(Counting.VOID, previous=old, compared=True, also_counts=also)
     write_handover(path.parent, given_up)
     robot.beat(old)
