@@ -10,6 +10,7 @@ from ros2_memory.core.reply import (
     INSIDE,
     LOCAL_OF_DAYS,
     NAME,
+    NAMES,
     OBJECT,
     OBJECTS,
     PAIRS,
@@ -152,6 +153,7 @@ def thing(most_stays: int) -> Keys:
     return keys(
         NAME("label").in_short,
         COUNTS_BY_NAME("labels").if_any,
+        NAMES("misread_as").if_any,
         PLAIN("moves").if_any.in_short,
         PLAIN("at_once").if_known.in_short,
         vector("xyz", 2)("place").in_short,
@@ -188,6 +190,7 @@ class Thing:
         robot: x, y (m) and yaw (rad) from which it was last seen; None if that is not known.
         still_there: what is known of it since then.
         moved: its places in order; empty if it has one place.
+        misread_as: labels of other things that were given to it.
         labels: how often each of several labels was given to it, the commonest first.
         at_once: how many were seen at the same time, of movers and of several things at one place;
             else None.
@@ -210,6 +213,7 @@ class Thing:
     robot: tuple[float, float, float] | None
     still_there: StillThere | None
     moved: tuple[ThingStay, ...] = ()
+    misread_as: tuple[str, ...] = ()
     labels: tuple[tuple[str, int], ...] = ()
     at_once: int | None = None
     moves: bool = False

@@ -322,7 +322,9 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) ->
             continue
         whole = stay.stay._replace(firm_first=-1, firm_last=-1)
         sizes = np.diff([0, *sorted(cuts), len(rows)])
-        parts += placed_stays(observed, [(stay.place, whole)] * len(sizes), rows, sizes)
+        split = placed_stays(observed, [(stay.place, whole)] * len(sizes), rows, sizes)
+        split[0].misread_as = stay.misread_as
+        parts += split
     return parts
 
 
@@ -361,7 +363,7 @@ def _without_overlap(stays: Sequence[PlacedStay], observed: Observations) -> lis
             [placed] = placed_stays(
                 observed, [(stay.place, stay.stay)], rows, np.array([len(rows)])
             )
-            trimmed.append(replace(placed, left=stay.left))
+            trimmed.append(replace(placed, misread_as=stay.misread_as, left=stay.left))
         else:
             trimmed.append(stay)
     return trimmed

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 LIMIT: Final = 12
+_MOST_NAMES: Final = 5
 _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
 """Detectors publish at their own times."""
@@ -412,9 +413,13 @@ class _Finder:
             moved.append(self.known.describe_stay(rows_there, place, shown.frame_id, self.places))
         has_moved = len(moved) > 1
         labels = self._count_names(rows)
+        misread = Counter[str]()
+        for stay in instance.stays:
+            misread.update(stay.misread_as)
         return replace(
             shown,
             labels=tuple(labels.items()) if len(labels) > 1 else (),
+            misread_as=_commonest(misread, instance.labels),
             spread_m=newest.stay.dev_mm / _MM,
             still_there=self._still_there(instance, newest),
             moved=tuple(moved) if has_moved else (),
@@ -479,6 +484,11 @@ class _Finder:
             return StillThere("in_view", last)
         # The estimate may end before the thing was looked at again.
         return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None
+
+
+def _commonest(counts: Counter[str], without: Collection[str]) -> tuple[str, ...]:
+    others = [name for name in counts if name not in without]
+    return tuple(sorted(others, key=lambda name: (-counts[name], name))[:_MOST_NAMES])
 
 
 def _grouped_by_place(stays: Sequence[_StayInWindow]) -> list[list[_StayInWindow]]:

@@ -47,6 +47,7 @@ class PlacedStay:
         place: the number of the place.
         stay: the slices of the stay.
         weak: whether it was seen too rarely to be a thing.
+        misread_as: how often it was seen under the labels of other things.
     """
 
     x: float
@@ -63,6 +64,7 @@ class PlacedStay:
     place: int
     stay: Stay
     weak: bool
+    misread_as: Counter[str] = field(default_factory=Counter)
 
     @property
     def at(self) -> Vector3:

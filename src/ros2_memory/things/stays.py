@@ -36,7 +36,7 @@ from ros2_memory.core.arrays import (
 )
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.things.carried import carried_spots
-from ros2_memory.things.instances import PlacedStay, Tally
+from ros2_memory.things.instances import PlacedStay, Tally, count_labels
 from ros2_memory.things.labels import moves_by_itself
 from ros2_memory.things.places import Sightings, poorly_localised
 from ros2_memory.things.presence import Cells, Evidence, Stay, half_turns
@@ -273,13 +273,21 @@ def end_where_carried_away(group: LabelGroup, observed: Observations) -> None:
 def remove_false_stays(
     groups: Sequence[LabelGroup], observed: Observations, keys: Sequence[str]
 ) -> None:
-    """Removes stays that are another thing under a wrong name, noise, or too rare."""
+    """Removes stays that are another thing under a wrong name, noise, or too rare.
+
+    Wrong names are counted in `PlacedStay.misread_as` of the thing that had them.
+    """
     stays = [(group, stay) for group in groups for stay in group.stays]
     hosts_of = dict(_HostSearch(stays, observed, keys).find())
     false_stays: set[int] = set()
     for number in sorted(hosts_of, key=lambda number: (stays[number][1].count, number)):
-        if not false_stays.issuperset(hosts_of[number]):
-            false_stays.add(number)
+        host = next((host for host in hosts_of[number] if host not in false_stays), None)
+        if host is None:
+            continue
+        false_stays.add(number)
+        (group, stay), (host_group, host_stay) = stays[number], stays[host]
+        if host_group is not group:
+            host_stay.misread_as += count_labels(observed.sights, observed.counts, stay.spots)
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):

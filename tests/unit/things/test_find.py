@@ -761,6 +761,7 @@ def test_two_labels_that_stand_apart_are_two_things_though_no_message_has_both(
     ]
     found = told_of(tmp_path, [*chain.from_iterable(messages)])
     assert found["labels"] == {"ball": 1, "can": 1}
+    assert not any("misread_as" in thing for thing in found["things"])
 
 
 def test_what_was_only_seen_while_the_robot_carried_it_has_no_place(tmp_path: Path) -> None:

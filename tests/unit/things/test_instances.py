@@ -1,6 +1,7 @@
 """Things by their sights alone: names, when one is missed, which looks count, usual places."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, TypeAlias
@@ -82,6 +83,18 @@ def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() 
     [mugs] = found.instances
     [stay] = mugs.stays
     assert (stay.count, found.side_by_side(stay.spots)) == (2700, 2)
+
+
+def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place() -> None:
+    before, away, beside = (0.0, 9.0, 0.0), (0.0, 0.0, 3.14), (-6.0, 6.0, 1.57)
+    called = ["bowl" if nth % 8 == 3 else "mug" for nth in range(120)]
+    seen = [(HERE, [(label, (2.0, 0.0, 0.7))]) for label in called]
+    elsewhere = [(beside, seen_at(-6.0, 8.0))] * 120
+    gone = [(before, seen_at(1.0, 9.0))] * 120 + [(before, [])] * 120
+    nothing: list[Seen] = [(away, [])] * 30
+    [mug] = estimated(*gone, *seen, *nothing, *elsewhere, *nothing, *seen).instances
+    assert len(mug.stays) == 4
+    assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
 
 
 @pytest.mark.parametrize(
