@@ -187,7 +187,7 @@ async def test_nothing_more_is_served_or_deleted(
     health = Health(memory, "1")
     json.dumps(await health(), ensure_ascii=False).encode()
     health.stop()
-    metrics = Metrics(MemoryGauges(memory), timeout_s=60)
+    metrics = Metrics(MemoryGauges(memory), "1", timeout_s=60)
     assert b"ros2_memory_bags" in (await metrics.exposition()).body
     metrics.stop()
     assert deleted(root) <= right[1]

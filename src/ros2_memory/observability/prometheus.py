@@ -19,7 +19,7 @@ from prometheus_client import (
     Counter,
     Histogram,
 )
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import generate_latest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
@@ -52,9 +52,11 @@ class Metrics(Observer):
     def __init__(
         self,
         measure: Callable[[], Sequence[Metric]],
+        version: str,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
         self._measure = measure
+        self._version = version
         self._timeout_s = timeout_s
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="metrics")
         self._measuring: asyncio.Future[Sequence[Metric]] | None = None
@@ -109,7 +111,10 @@ class Metrics(Observer):
             return ()
 
     def collect(self) -> Iterator[Metric]:
-        """Yields the gauges of the memory, for the registry."""
+        """Yields the version and the gauges of the memory, for the registry."""
+        yield InfoMetricFamily(
+            "ros2_memory_build", "The version of this server.", {"version": self._version}
+        )
         yield from self._gauges
 
 
@@ -186,6 +191,16 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
         **{str(state): int(state is heartbeat.state) for state in RecorderState},
     )
     yield GaugeMetricFamily(
+        "ros2_memory_recorder_state_since_timestamp_seconds",
+        "When that state began, Unix time.",
+        unix_from_ns(heartbeat.since),
+    )
+    yield GaugeMetricFamily(
+        "ros2_memory_recorder_heartbeat_age_seconds",
+        "Time since the recorder last reported.",
+        unix_from_ns(now - heartbeat.updated),
+    )
+    yield GaugeMetricFamily(
         "ros2_memory_recorder_silent_topics",
         "Subscribed topics without a message.",
         len(heartbeat.silent),
@@ -198,6 +213,11 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     for topic, messages in heartbeat.lost.items():
         lost.add_metric((topic,), messages)
     yield lost
+    yield CounterMetricFamily(
+        "ros2_memory_recorder_written_bytes",
+        "Bytes that the recorder has written since it started.",
+        heartbeat.bytes_written,
+    )
     yield CounterMetricFamily(
         "ros2_memory_recorder_restarts",
         "Changes of the recorder's process, as seen by scrapes.",

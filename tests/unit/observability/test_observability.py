@@ -71,7 +71,7 @@ def at(found: Samples, name: str, **labels: str) -> float:
 
 
 async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole() -> None:
-    metrics = Metrics(lambda: ())
+    metrics = Metrics(lambda: (), "1")
     full = tool("full", lambda _: value(7))
     dispatcher = served(full, telemetry=Telemetry((metrics,))).dispatcher
     hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
@@ -95,7 +95,7 @@ async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None
         freed.wait()
         return [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
 
-    metrics = Metrics(hanging, timeout_s=0.01)
+    metrics = Metrics(hanging, "1", timeout_s=0.01)
     metrics.answered(Answered("ask", "ok", 0.03, 12, "abc", {}))
     try:
         for _ in range(2):
@@ -111,7 +111,7 @@ async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None
 async def test_a_measurement_that_fails_is_logged_and_costs_the_figures_of_the_memory_alone(
     fault: Exception,
 ) -> None:
-    metrics = Metrics(Mock(side_effect=fault))
+    metrics = Metrics(Mock(side_effect=fault), "1")
     metrics.answered(Answered("ask", "ok", 0.03, 12, "abc", {}))
     with capture_logs() as captured:
         found = await scraped(metrics)
@@ -119,14 +119,14 @@ async def test_a_measurement_that_fails_is_logged_and_costs_the_figures_of_the_m
     assert [event["event"] for event in captured] == ["metrics_not_measured"]
     metrics.stop()
     # As a scrape may find it while the server ends.
-    assert at(await scraped(metrics), "answers_total", tool="ask", outcome="ok", reason="") == 1
+    assert at(await scraped(metrics), "build_info", version="1") == 1
 
 
 def test_metrics_of_other_libraries_stay_as_they_are() -> None:
     enable_created_metrics()  # type: ignore[no-untyped-call]
     registry = CollectorRegistry()
     Counter("other", "Of another library.", registry=registry)
-    Metrics(lambda: ()).stop()
+    Metrics(lambda: (), "1").stop()
     assert "other_created" in generate_latest(registry).decode()
 
 
@@ -160,15 +160,18 @@ def test_the_bag_directory_is_not_scanned_for_them(tmp_path: Path) -> None:
 def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_path: Path) -> None:
     clock = SettableClock(T0 + 9 * NS_PER_S)
     gauges = MemoryGauges(memory_of(tmp_path, clock=clock))
-    told = {"pid": 7, "silent": ("/b",), "lost": {"/odom": 3}}
+    told = {"pid": 7, "since": T0, "bytes_written": 700, "silent": ("/b",), "lost": {"/odom": 3}}
     beat(tmp_path, T0 + 5 * NS_PER_S, RecorderState.PAUSED, **told)
     found = measured(gauges)
     states = [each for each in RecorderState if found[f"recorder_state {each}"]]
     assert states == [RecorderState.PAUSED]
     expected = {
         "live": 1,
+        "heartbeat_age_seconds": 4.0,
+        "written_bytes_total": 700,
         "silent_topics": 1,
         "restarts_total": 0,
+        "state_since_timestamp_seconds": T0 / NS_PER_S,
         "lost_messages /odom": 3,
     }
     assert {name: found[f"recorder_{name}"] for name in expected} == expected
