@@ -311,13 +311,7 @@ def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[Parall
     """
     parallel: list[ParallelRecordings] = []
     if topic not in view.timeline.transient_local:
-        differing = _parallel_recordings(view, topic, window)
-        if differing is None:
-            view.notes.add(
-                f"not compared: whether recordings of one time have different messages on {topic}, "
-                "as of several robots"
-            )
-        parallel += differing or ()
+        parallel += _parallel_recordings(view, topic, window) or ()
     holding = view.timeline.recordings(topic)
     parallel += (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
     return parallel
@@ -344,21 +338,27 @@ def _parallel_recordings(
 ) -> list[ParallelRecordings] | None:
     """Returns the recordings with different messages on a topic at the same time.
 
-    Of many pairs the first `most_pairs` are compared. None if the call's time is over before it is
-    known, or if a lake does not hold the messages.
+    Of many pairs the first `most_pairs` are compared. None, with a note, if the call's time is over
+    before it is known; None, too, if a lake does not hold the messages.
     """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     # The answer itself does not need what is read here.
-    with view.notes.apart(), suppress(QueryTimeoutError, NotInLakeError):
-        for parallel in islice(_overlapping_pairs(view, topic, window), most_pairs):
-            pair = parallel.first, parallel.other
-            # Several robots in one folder have thousands of pairs: each recording is enough once.
-            is_known = not parallel.by_clock and apart.issuperset(pair)
-            if not is_known and _differ(view, topic, pair, parallel.span.intersect(window)):
-                differing.append(parallel)
-                apart.update(() if parallel.by_clock else pair)
-        return differing
+    try:
+        with view.notes.apart(), suppress(NotInLakeError):
+            for parallel in islice(_overlapping_pairs(view, topic, window), most_pairs):
+                pair = parallel.first, parallel.other
+                # Several robots in one folder have thousands of pairs: once is enough for each.
+                is_known = not parallel.by_clock and apart.issuperset(pair)
+                if not is_known and _differ(view, topic, pair, parallel.span.intersect(window)):
+                    differing.append(parallel)
+                    apart.update(() if parallel.by_clock else pair)
+            return differing
+    except QueryTimeoutError:
+        view.notes.add(
+            "out of time before it was known whether recordings of one time have different "
+            f"messages on {topic}, as of several robots"
+        )
     return None
 
 

@@ -84,7 +84,7 @@ def test_robots_that_there_is_no_time_to_tell_apart_are_no_single_one(
 ) -> None:
     monkeypatch.setattr(robots, "_lacks_most", Mock(side_effect=QueryTimeoutError("late")))
     reply = asked(both, "get_topic_in_range", topic="/odom", start=T0_S + 7, end=T0_S + 9)
-    assert "not compared: whether recordings of one time have different" in str(reply["notes"])
+    assert "known whether recordings of one time have different messages" in str(reply["notes"])
 
 
 def driven(memory: Memory, start: int, stop: int) -> Any:
