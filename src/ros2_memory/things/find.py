@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.history.context import Call, Memory, QuerySettings
+    from ros2_memory.history.view import View
 
 LIMIT: Final = 12
 _MOST_NAMES: Final = 5
@@ -89,12 +90,7 @@ def find_things(
     nearness = None if near is None else parse_near(limits, near)
     lowest = limits.min_score if min_score is None else min_score
     view, now, asked_window = open_search(memory, call, TimeRange(start_s, end_s))
-    searched = asked_window
-    begin, _ = asked_window.asked()
-    ahead_from = view.snapshot.dating.ahead_from
-    if end_s is None and begin < ahead_from:
-        # A wrong clock dated the rest.
-        searched = TimeWindow(asked_window.start, ahead_from)
+    searched = asked_window if end_s is not None else _rightly_dated(view, asked_window)
     require_recorded(view, searched)
     window = clamped(view, searched)
     if lowest > 1:
@@ -144,13 +140,23 @@ def find_things(
         notes=(
             *view.notes.sentences(),
             *notes_on(view, known.by_all, question),
-            *scatter_notes(
-                Scattered(thing.label, thing.frame_id, thing.place, thing.spread_m)
-                for thing in shown
-                if not thing.moves
-            ),
+            *scatter_notes(_standing(shown)),
         ),
     )
+
+
+def _rightly_dated(view: View, window: TimeWindow) -> TimeWindow:
+    """Returns a window up to what a wrong clock dated, unless that is all that it has."""
+    begin, _ = window.asked()
+    ahead_from = view.snapshot.dating.ahead_from
+    return TimeWindow(window.start, ahead_from) if begin < ahead_from else window
+
+
+def _standing(things: Iterable[Thing]) -> Iterator[Scattered]:
+    """Yields the places of the things that did not move."""
+    for thing in things:
+        if not thing.moves:
+            yield Scattered(thing.label, thing.frame_id, thing.place, thing.spread_m)
 
 
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
