@@ -632,7 +632,12 @@ def _last(
         early = answer is not None and answer.get("error") == "no_data"
         # Coordinates may be those of another frame: the note says which one was compared.
         notes = [] if answer is None else answer.get("notes", [])
-        noted = all(each.startswith("near_position compared") for each in notes)
+        is_first = before is not None and all(row.log_ns > before - SLACK_NS for row in rows)
+        noted = all(
+            note.startswith("near_position compared")
+            or (is_first and note.endswith("nothing was searched"))
+            for note in notes
+        )
         told = answer is None or early or (notes and noted)
         return None if None in found and told else f"it held at {found}"
     right = any(each is not None and _same_time(answer["timestamp"], each) for each in found)
