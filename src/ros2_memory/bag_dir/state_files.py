@@ -697,12 +697,14 @@ class ScreenState:
     its excluded messages have been cut out. The state of the rules is written before a file is cut,
     since the messages cannot be read again.
 
-    `earlier` has the spans before those in `excluded`; those close to each other are one.
+    `earlier` has the spans before those in `excluded`, and `earlier_held` those of them in which
+    the condition held; spans close to each other are one.
     """
 
     recordings: dict[str, RecordingScreen] = field(default_factory=dict)
     excluded: list[Excluded] = field(default_factory=list)
     earlier: list[tuple[Int64, Int64]] = field(default_factory=list)
+    earlier_held: list[tuple[Int64, Int64]] = field(default_factory=list)
 
 
 class Withheld(NamedTuple):

@@ -20,7 +20,7 @@ from collections import Counter
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves
@@ -217,7 +217,7 @@ class Screening:
     ) -> None:
         """Cuts a split and marks it as released in the state; a fault is reported."""
         try:
-            self._cut_split(path, summary, stretches, state.excluded)
+            self._cut_split(path, summary, stretches, _excluded_before(state))
         except (EpisodicError, OSError) as error:
             self._report(path, error)
             self._put_off(path)
@@ -225,9 +225,10 @@ class Screening:
         state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
         if not summary.empty:
             excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
-            older = [stretch.span for stretch in excluded[:-MOST_EXCLUDED]]
-            state.excluded = excluded[-MOST_EXCLUDED:]
-            state.earlier = _joined([*state.earlier, *older])
+            older, state.excluded = excluded[:-MOST_EXCLUDED], excluded[-MOST_EXCLUDED:]
+            held = [stretch.span for stretch in older if stretch.held]
+            state.earlier = _joined([*state.earlier, *(stretch.span for stretch in older)])
+            state.earlier_held = _joined([*state.earlier_held, *held])
         self._problems.pop(_file_name(path), None)
         self._retry_s.pop(path, None)
 
@@ -499,6 +500,12 @@ class Screening:
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
         self._problems[name] = reason
+
+
+def _excluded_before(state: ScreenState) -> list[Excluded]:
+    """Returns the stretches that were excluded; in older ones it is known where they held."""
+    unknown = [Excluded(*span, held=False) for span in state.earlier]
+    return [*unknown, *starmap(Excluded, state.earlier_held), *state.excluded]
 
 
 def _joined(spans: Spans) -> Spans:

@@ -166,6 +166,26 @@ def test_latched_messages_from_before_stay(bags: ScreenedBags) -> None:
     assert bags.seconds("/map") == [1.0, 11.0]
 
 
+def test_a_latched_message_that_was_excluded_long_ago_does_not_come_back(
+    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(screening, "MOST_EXCLUDED", 3)
+    maps = [word(1, "/map"), word(6, "/map")]
+    name = bags.begin(0)
+    bags.split(name, [off(0), *maps[:1], on(5), *maps[1:], off(8), *words(0, 10)])
+    for begin in range(10, 120, 10):
+        before, name = name, bags.begin(begin)
+        bags.end(before)
+        bags.split(name, [off(begin), on(begin + 3), off(begin + 6), *words(begin, begin + 10)])
+        bags.step()
+    before, name = name, bags.begin(120)
+    bags.end(before)
+    again = [replace(each, log_time=T0 + 121 * S, publish_time=each.log_time) for each in maps]
+    bags.split(name, [off(120), *again, off(121), *words(121, 130)])
+    bags.end()
+    assert bags.seconds("/map") == [1.0, 121.0]
+
+
 def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: ScreenedBags) -> None:
     name = bags.begin(0)
     # Nothing is known of the mode yet: what the next recording receives again may be served.
