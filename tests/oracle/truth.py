@@ -89,7 +89,8 @@ class Topic:
     def bounds(self, start: int, end: int) -> tuple[list[Row], list[Row]]:
         """The messages that every answer about `[start, end]` has, and those that it may have."""
         surely = self.within(start + SLACK_NS, end - SLACK_NS)
-        return surely, self.within(start - EARLY_NS, end + SLACK_NS)
+        # A float of seconds in 2026 is exact to 0.25 us.
+        return surely, self.within(start - EARLY_NS, end + SLACK_NS + 250)
 
 
 @dataclass
