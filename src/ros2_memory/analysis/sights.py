@@ -47,7 +47,7 @@ NO_YAW: Final = -1
 STOREY_MM: Final = 2_000
 """Two points that differ so much in height are on different floors."""
 _UPRIGHT: Final = 3
-"""How far up is along z of what carries a detector that does not lean, in thirds."""
+"""The z component of the up direction for a detector that does not lean, in thirds."""
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05; scores above 1 are in the last bin."""
 SLICE_NS: Final = 10 * NS_PER_S
@@ -121,8 +121,9 @@ class DetectorMessages(NamedTuple):
     Attributes:
         times: for each message, its log time (ns).
         robot: for each message, x, y, z (m) and yaw (rad) of the robot, the angle (rad) by which
-            the detector was turned from the robot's heading, and the direction of up in the frame
-            of what carries the detector (M x 8); NaN if not known. A lift adds to z.
+            the detector was turned from the robot's heading, and the up direction as a unit vector
+            in the frame that the detector is mounted on (M x 8); NaN if not known. A lift adds
+            to z.
         rows: for each detection, the index of its message, ascending.
         labels: for each detection, the index of its label in `names`.
         names: the labels; some may have no detection.

@@ -214,9 +214,9 @@ class _Side(NamedTuple):
     recorded_s: float
 
     def none_on(self, topics: Iterable[str]) -> float | None:
-        """Returns the number of what is not listed: 0, or None if no topic of it was recorded.
+        """Returns the number of reports where none is listed: 0, or None if no topic was recorded.
 
-        A log was, if anything was: it has messages only when there is something to say.
+        A log counts as recorded if anything was: it has messages only when something happens.
         """
         timeline = self.view.timeline
         are_recorded = any(

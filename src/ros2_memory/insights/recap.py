@@ -331,7 +331,7 @@ def _reported_events(
         toggles = _toggles(view, topic, topic_events)
         if toggles and is_latched(view, topic):  # a latched value holds through gaps
             events += _flip_events(topic, toggles, breaks_of(view, topic))
-        elif toggles and view.timeline.is_on_events(topic):  # nothing is said between two goals
+        elif toggles and view.timeline.is_on_events(topic):  # there are no messages between goals
             heard = heard_times(view, [topic], window)
             events += _flip_events(topic, toggles, [stop - 1 for _, stop in heard])
         elif toggles:

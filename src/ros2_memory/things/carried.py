@@ -1,7 +1,7 @@
-"""Detections of what the robot carries: a thing in a gripper, or on a tray, moves with the robot.
+"""Detections of carried things: a thing in a gripper, or on a tray, moves with the robot.
 
-While the robot drives, such a thing is seen at one place relative to the robot, and in the map at
-a new one each time. None of these is a place of the thing: it is where the robot passed with it.
+While the robot drives, such a thing stays at one place in the robot's frame, and is at a new one
+in the map each time. None of these is a place of the thing: the robot only passed there with it.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Flags
 
 _FEWEST: Final = 3
-"""Fewer spots in a row may be things that are alike, and at which the robot stops alike."""
+"""Fewer spots in a row may be similar things, each seen from the same side."""
 _REACH_MM: Final = 1500.0
-"""What a robot holds is not farther from its middle."""
+"""The farthest that a carried thing is from the origin of the robot's frame."""
 _STEP_MM: Final = 300.0
-"""The thing was elsewhere in the map in each of the spots, ..."""
+"""From one spot to the next a carried thing moves at least so far in the map, ..."""
 _SAME_MM: Final = 200.0
-"""... and here before the robot: the robot's pose is known to a quarter of a cell."""
+"""... and at most so far in the robot's frame, whose pose is known to a quarter of a cell."""
 _PAUSE_NS: Final = 15 * NS_PER_S
 _FIXED_SHARE: Final = 0.15
-"""What scatters by less than this share of the way on which it was seen stands still.
+"""A thing stands still if its detections scatter by less than this share of the robot's way.
 
-What moves along scatters by a third of that way.
+Those of a carried thing scatter by a third of that way.
 """
 
 

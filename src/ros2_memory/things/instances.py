@@ -179,7 +179,7 @@ class Estimate:
     counts: Ints
     """How many detections of each spot count."""
     carried: Flags
-    """Which spots are of what the robot carried: none of their detections counts."""
+    """Which spots are of carried things: none of their detections counts."""
     poor: Flags
     """Which spots were seen while localisation was poor."""
     names: dict[str, str]

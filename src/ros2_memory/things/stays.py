@@ -81,7 +81,7 @@ class LabelGroup:
 
     Attributes:
         rows: the spots that count.
-        carried: the spots of what the robot carried.
+        carried: the spots seen while the robot carried the thing.
         unplaced: rows of `Sights.unplaced` with the label, in all epochs.
         places: the spots at each place.
     """
@@ -100,8 +100,8 @@ class Observations:
     """The sights of an estimate, and what is computed once for all labels.
 
     Attributes:
-        counts: how many detections of each spot count; none of what the robot carried.
-        carried: which spots are of what the robot carried.
+        counts: how many detections of each spot count; none of carried things.
+        carried: which spots are of carried things.
         poor: which spots were seen while localisation was poor: they move nothing.
         hits: the looks of detections that count, by spot; -1 where localisation was poor.
         groups: a number for each spot, equal for spots of one slice, topic and label.

@@ -110,7 +110,7 @@ class _LabelDetections(NamedTuple):
     Attributes:
         counted: detections that count.
         low: detections with too low a score.
-        carried: detections of what the robot carried.
+        carried: detections while the robot carried it.
         last_carried: their last log time (ns), if none that counts is later; else `MIN_NS`.
         unplaced: detections without a place.
         first_unplaced, last_unplaced: their first and last log time (ns).
