@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import Floats, Vectors, joined_codes, stable_order
+from ros2_memory.core.arrays import Flags, Floats, Vectors, joined_codes, run_starts, stable_order
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """The least time between two poses by transforms."""
+WANDERS_M: Final = 0.02
+"""The standard deviation with which the position of a robot at rest may wander, as that of a filter
+with a satellite receiver does. This is no noise from pose to pose, which averages out."""
+_RESTING_MPS: Final = 0.02
+SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
+"""The time over which poses are averaged to find out whether the robot stands."""
 
 
 class FrameCodes(NamedTuple):
@@ -70,6 +76,17 @@ class Poses:
             FrameCodes(self.frames.codes[which], self.frames.words),
             self.speeds[which],
         )
+
+    def at_rest(self) -> Flags:
+        """Returns which poses are of a robot at rest, by the mean speed stated in their slot.
+
+        A speed of 0 shows nothing: some publishers leave the twist out, and the odometry of wheels
+        that stand does not wander.
+        """
+        begins = run_starts(self.times // SLOT_NS)
+        sizes = np.diff(begins, append=len(self))
+        means_mps = np.add.reduceat(self.speeds, begins) / sizes if len(self) else self.speeds
+        return np.repeat((means_mps > 0) & (means_mps <= _RESTING_MPS), sizes)
 
     def between(self, start: int, stop: int) -> Poses:
         """Returns the poses with log times (ns) in `[start, stop)`."""

@@ -5,7 +5,8 @@ It begins with the first pose at its place and ends with the last one.
 
 - **Slots.** Poses are averaged in slots of `SLOT_NS`, so that noise averages out. Consecutive slots
   are linked if a drift of `DRIFT_MPS`, or the noise of their poses, explains the distance of their
-  means. Linked slots form a chain. Its first and last slot may be half motion and are left out.
+  means, or the wandering of a position at rest (`Poses.at_rest`). Linked slots form a chain. Its
+  first and last slot may be half motion and are left out.
 - **Blocks.** Noise may hide slow motion from two slots, but not from the slots of a block of
   `BLOCK_NS`. A block whose means spread farther than drift and noise explain is motion, and splits
   the chain.
@@ -42,7 +43,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.poses import Poses, headings
+from ros2_memory.analysis.poses import SLOT_NS, WANDERS_M, Poses, headings
 from ros2_memory.core.arrays import (
     Flags,
     Floats,
@@ -68,7 +69,6 @@ SHORTEST_NS: Final = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
 SILENCE_NS: Final = 5 * NS_PER_S // 2
 """Between poses farther apart nothing is known: a standstill ends there."""
-SLOT_NS: Final = 2 * NS_PER_S // 5
 BLOCK_NS: Final = 5 * SLOT_NS
 BESIDE_NS: Final = SHORTEST_NS + 3 * NS_PER_S
 """Poses so far before and after a stretch of time take part in its blocks."""
@@ -260,10 +260,10 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
         start: log time (ns) at which the stretch begins, the begin of a block.
         stop: log time (ns) at which it ends, the end of a block.
     """
-    valid = are_places(poses.positions)
-    if not valid.any():
+    valid = np.flatnonzero(are_places(poses.positions))
+    if not valid.size:
         return NO_BLOCKS
-    slots = _Slots(poses.times[valid], poses.positions[valid])
+    slots = _Slots(poses.rows(valid))
     links = slots.links()
     to_previous, to_next = np.r_[False, links], np.r_[links, False]
     begins_chain = to_next & ~to_previous
@@ -295,6 +295,7 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     starts_ns = numbers[begins] * BLOCK_NS
     means = slots.means[inner]
     noises = slots.noises(inner, inner + 1) / np.sqrt(slots.counts[inner])
+    noises = np.maximum(noises, slots.wander_m[inner])
     lows, highs = (
         np.rint(extreme.reduceat(means, begins) * PER_METRE).astype(np.int64)
         for extreme in (np.minimum, np.maximum)
@@ -333,16 +334,19 @@ class _Slots:
         numbers: for each slot, its number since the epoch.
         firsts: for each slot, the log time of its first pose.
         lasts: for each slot, the log time of its last pose.
+        wander_m: for each slot, the standard deviation with which its mean may wander at rest.
     """
 
-    def __init__(self, times: Ints, positions: Vectors) -> None:
-        self.times, self.positions = times, positions
+    def __init__(self, poses: Poses) -> None:
+        times = self.times = poses.times
+        self.positions = poses.positions
         slots = times // SLOT_NS
         self.begins = run_starts(slots)
         self.stops = np.r_[self.begins[1:], times.size]
         self.counts = self.stops - self.begins
         self.numbers = slots[self.begins]
         self.firsts, self.lasts = times[self.begins], times[self.stops - 1]
+        self.wander_m = np.where(poses.at_rest()[self.begins], WANDERS_M, 0.0)
 
     def __len__(self) -> int:
         return self.begins.size
@@ -393,7 +397,10 @@ class _Slots:
         """Returns whether the robot may have stood still from each slot to the next one."""
         follows = self.firsts[1:] - self.lasts[:-1] <= SILENCE_NS
         apart_m = _lengths(np.diff(self.means, axis=0))
-        allowed_m = DRIFT_MPS * (np.diff(self.numbers) * SLOT_NS / NS_PER_S)
+        allowed_m = np.maximum(
+            DRIFT_MPS * (np.diff(self.numbers) * SLOT_NS / NS_PER_S),
+            _NOISE_FACTOR * np.minimum(self.wander_m[:-1], self.wander_m[1:]),
+        )
         _, edges = self._bends
         many = edges[2:] - edges[:-2]
         unsure = np.flatnonzero(follows & (apart_m > allowed_m) & (many > 0))

@@ -26,7 +26,7 @@ from ros2_memory.analysis.motion.odometry import (
     measured_path,
 )
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.poses import Poses, headings, joined_poses
+from ros2_memory.analysis.poses import WANDERS_M, Poses, headings, joined_poses
 from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stable_order, stacked
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.text import counted
@@ -57,6 +57,8 @@ _OF_TIME: Final = 0.7
 are right within 2.5 cm."""
 _FEW: Final = 32
 """Neighbouring slices with at most so many poses each are measured together."""
+_WIDEST_WANDER: Final = 5.0
+"""A position at rest is at most so many standard deviations from its place, on each axis."""
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
 _BYTES: Final = 3000
@@ -249,7 +251,7 @@ def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathS
     stated = placed.speeds[np.isfinite(placed.speeds)]
     totals, step_mps, line, error_m = MotionTotals(), 0.0, NO_LINE, 0.0
     if len(placed):
-        measured = measured_path(placed.times, placed.positions, fastest_mps)
+        measured = measured_path(placed.times, _without_wander(placed), fastest_mps)
         totals, step_mps = measured.totals, measured.step_mps
         if draws:
             line, error_m = _line_through(placed, measured)
@@ -266,6 +268,20 @@ def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathS
         error_m,
         poses if len(placed) <= _FEW else None,
     )
+
+
+def _without_wander(poses: Poses) -> Vectors:
+    """Returns the positions (m); those of a rest are one place, if they are that near to it."""
+    positions, at_rest = poses.positions, poses.at_rest()
+    if not at_rest.any():
+        return positions
+    positions = positions.copy()
+    edges = np.flatnonzero(np.diff(at_rest, prepend=False, append=False))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        place = positions[begin:end].mean(axis=0)
+        if (np.abs(positions[begin:end] - place) <= _WIDEST_WANDER * WANDERS_M).all():
+            positions[begin:end] = place
+    return positions
 
 
 def _line_through(poses: Poses, measured: MeasuredPath) -> tuple[Line, float]:

@@ -2,9 +2,11 @@
 
 import math
 import random
+from dataclasses import replace
 from itertools import chain, count, pairwise
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +15,7 @@ from ros2_memory.analysis.motion.standstills import DROP_SLOT_NS, SpeedDrop, spe
 from ros2_memory.analysis.poses import Poses as PoseArrays
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import LONG
-from tests.unit.analysis.motion.posed import posed, stood_in
+from tests.unit.analysis.motion.posed import posed, stood_in, way_of
 
 Poses = list[tuple[int, tuple[float, float, float]]]
 S = NS_PER_S
@@ -238,3 +240,29 @@ def test_noise_of_rare_poses_does_not_part_a_standstill(seed: int) -> None:
     [whole] = standstills_of(poses)
     assert whole == pytest.approx((124, 140), abs=0.5)
     assert standstills_of(poses, blocks=3) == [whole]
+
+
+@pytest.mark.parametrize("stated", [0.003, 0.0])
+def test_what_wanders_while_next_to_no_speed_is_stated_stands_still(stated: float) -> None:
+    legs = [(20.0, 0.6), (60.0, 0.0), (20.0, 0.6), (200.0, 0.0), (20.0, 0.6)]
+    made = world(legs, hz=10)
+    drawn = random.Random(11)
+    wander = [0.0, 0.0]
+    poses: Poses = []
+    speeds: list[float] = []
+    for time, (x, y, z) in made.poses:
+        # A filter with a satellite receiver: 2 cm, correlated over a second.
+        wander = [0.9 * off + drawn.gauss(0, 0.02 * math.sqrt(0.19)) for off in wander]
+        poses.append((time, (x + wander[0], y + wander[1], z)))
+        stands = any(start <= time / S <= end for start, end in made.standing)
+        speeds.append(stated * drawn.uniform(0.5, 1.5) if stands else 0.6)
+    arrays = replace(posed(poses), speeds=np.array(speeds))
+    stops, _ = stood_in(arrays)
+    path = way_of(arrays, fastest_mps=5.0).totals
+    if stated:
+        assert len(stops) == 2
+        assert [stop.end - stop.start for stop in stops] == pytest.approx([60 * S, 200 * S], abs=S)
+        assert path.distance_m == pytest.approx(36, rel=0.05)
+    else:  # a publisher that leaves the twist out: what moves by more than it drifts is driven
+        assert sum(stop.end - stop.start for stop in stops) < 60 * S
+        assert path.distance_m > 40
