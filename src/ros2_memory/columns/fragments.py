@@ -13,9 +13,8 @@ import struct
 import sys
 import threading
 from collections import deque
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from io import BytesIO
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -25,7 +24,7 @@ from ros2_memory.columns.steps import EXACT, METRES
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -38,15 +37,10 @@ if TYPE_CHECKING:
 _MOST_WAITING: Final = 1_024
 """Fragments that wait to be stored; if there are more, the oldest have to be made again."""
 
-_LARGEST_INT64: Final = (1 << 63) - 1
 _KEY_BYTES: Final = 400
 """About how much memory it takes to remember a fragment, besides its own."""
 _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
-_TUPLE, _BYTES, _ARRAY, _ROWS, _COLUMN = -1, -2, -3, -4, -5
-"""What a list in the JSON of a fragment is; numbers from 0 on are those of classes."""
-_NUMBERS: Final = {int: "<i8", float: "<f8"}
-_PLAIN: Final = frozenset({int, float, bool, type(None)})
 
 log = get_logger(__name__)
 
@@ -81,90 +75,31 @@ class FragmentKind(NamedTuple, Generic[T]):
 def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """Returns a fragment as bytes: a line of JSON, then the bytes of arrays one after the other.
 
-    Each list in the JSON begins with a number that says what it is. A tuple of values of one type
-    is stored column by column, since that is faster to restore than value by value.
+    In the JSON all but numbers, texts and None is an object with one key: what is made of the list
+    of arguments behind it, such as `tuple`, or the number of a class.
     """
-    writer = _Writer({cls: number for number, cls in enumerate(classes)})
-    head = json.dumps(writer.json_of(fragment))
-    return compress(b"".join((head.encode(), b"\n", *writer.data)))
+    numbers = {cls: str(number) for number, cls in enumerate(classes)}
+    data: list[bytes] = []
 
-
-@dataclass(slots=True)
-class _Writer:
-    """Turns fragments into JSON and bytes.
-
-    Attributes:
-        numbers: the number of each class.
-        data: the bytes of arrays so far.
-    """
-
-    numbers: Mapping[type, int]
-    data: list[bytes] = field(default_factory=list)
-
-    def json_of(self, value: object) -> object:
-        """Returns a value as JSON; adds the bytes of its arrays."""
+    def json_of(value: object) -> object:
+        maker, arguments = numbers.get(type(value), "tuple"), value
         if isinstance(value, bytes):
-            self.data.append(value)
-            return [_BYTES, len(value)]
+            data.append(value)
+            return {"bytes": [len(value)]}
         if isinstance(value, np.ndarray):
             codec, least, packed = _pack_array(value)
-            self.data.append(packed)
-            return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
+            data.append(packed)
+            return {"array": [len(packed), codec, least, value.dtype.str, *value.shape]}
         if isinstance(value, dict):
-            return {key: self.json_of(entry) for key, entry in value.items()}
-        number = self.numbers.get(type(value))
-        if number is not None:
-            return [number, *map(self.json_of, _attributes(value))]
-        return self._json_of_tuple(value) if isinstance(value, tuple | list) else value
+            maker, arguments = "dict", value.items()
+        elif is_dataclass(value):
+            arguments = [getattr(value, attribute.name) for attribute in fields(value)]
+        elif not isinstance(value, tuple | list):
+            return value
+        return {maker: [*map(json_of, cast("Iterable[object]", arguments))]}
 
-    def _json_of_tuple(self, values: Sequence[object]) -> list[object]:
-        """Returns several values as JSON, column by column if all but None are of one type."""
-        present = [value for value in values if value is not None]
-        none_at = [nth for nth, value in enumerate(values) if value is None]
-        types = {*map(type, present)}
-        if len(types) == 1 < len(present):
-            cls = types.pop()
-            columns = self._json_of_columns(cls, present, none_at)
-            if columns is not None:
-                return columns
-        return [_TUPLE, *map(self.json_of, values)]
-
-    def _json_of_columns(
-        self, cls: type, values: Sequence[object], none_at: Sequence[int]
-    ) -> list[object] | None:
-        """Returns values of one type as JSON, column by column; None if they have no columns.
-
-        Args:
-            cls: the type.
-            values: at least two.
-            none_at: the places of None among them.
-        """
-        if cls in _NUMBERS:
-            if cls is int and max(map(abs, cast("list[int]", values))) > _LARGEST_INT64:
-                return None
-            numbers = np.array(values, _NUMBERS[cls]).tobytes()
-            self.data.append(numbers)
-            return [_COLUMN, len(numbers), none_at, _NUMBERS[cls]]
-        head = [_ROWS, [_TUPLE, *none_at]]
-        if cls is np.ndarray:
-            arrays = cast("list[Array]", values)
-            if len({(array.dtype, array.shape[1:]) for array in arrays}) > 1:
-                return None
-            sizes = [_TUPLE, *map(len, arrays)]
-            return [*head, sizes, self.json_of(np.concatenate(arrays))]
-        has_attributes = cls is tuple or cls in self.numbers
-        rows = [*map(_attributes, values)] if has_attributes else [()]
-        if not rows[0] or len({*map(len, rows)}) > 1:
-            return None
-        columns = map(self._json_of_tuple, zip(*rows, strict=True))
-        return [*head, self.numbers.get(cls, _TUPLE), *columns]
-
-
-def _attributes(value: object) -> Sequence[object]:
-    """Returns the attributes of a dataclass, or the entries of a tuple."""
-    if is_dataclass(value):
-        return [getattr(value, attribute.name) for attribute in fields(value)]
-    return cast("Sequence[object]", value)
+    head = json.dumps(json_of(fragment))
+    return compress(b"".join((head.encode(), b"\n", *data)))
 
 
 def from_bytes(data: bytes, classes: Sequence[type]) -> object:
@@ -174,63 +109,27 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
         ValueError, TypeError, LookupError, struct.error: the bytes are no fragment.
     """
     head, tail = decompress(data).split(b"\n", 1)
-    return _restore(json.loads(head), classes, BytesIO(tail))
+    read = BytesIO(tail).read  # arrays are made in the order in which they were written
 
+    def made(value: dict[str, object]) -> object:
+        [(maker, arguments)] = value.items()
+        if not isinstance(arguments, list):
+            raise TypeError("something is made without arguments")
+        if maker == "tuple":
+            return (*arguments,)
+        if maker == "dict":  # names of columns are in thousands of fragments
+            return {sys.intern(key): entry for key, entry in arguments}
+        if maker == "bytes":
+            return read(*arguments)
+        if maker == "array":
+            size, *how = arguments
+            return _unpack_array(read(size), *how)
+        return classes[int(maker)](*arguments)
 
-def _restore(value: object, classes: Sequence[type], tail: BytesIO) -> object:
-    """Returns the value that `_Writer.json_of` turned into JSON.
-
-    Args:
-        value: the JSON.
-        classes: of the kind of fragments.
-        tail: the bytes of arrays; those of this value are next.
-    """
-    if isinstance(value, dict):
-        return {sys.intern(key): _restore(entry, classes, tail) for key, entry in value.items()}
-    if not isinstance(value, list):
-        # Names of columns and labels are in thousands of fragments.
-        return sys.intern(value) if isinstance(value, str) else value
-    number, *rest = value
-    if number in {_BYTES, _ARRAY}:
-        size, *array = rest
-        packed = tail.read(size)
-        return packed if number == _BYTES else _unpack_array(packed, *array)
-    if number == _COLUMN:
-        size, none_at, dtype = rest
-        return _with_none(np.frombuffer(tail.read(size), dtype).tolist(), none_at)
-    parts = rest
-    # Most are numbers: a call for each would take half of the time.
-    if not _PLAIN.issuperset(map(type, rest)):
-        parts = [part if type(part) in _PLAIN else _restore(part, classes, tail) for part in rest]
-    if number == _ROWS:
-        none_at, kind, *columns = cast("list[Sequence[object]]", parts)
-        return _with_none(_rows(kind, columns, classes), cast("Sequence[int]", none_at))
-    return tuple(parts) if number == _TUPLE else classes[number](*parts)
-
-
-def _rows(
-    kind: object, columns: Sequence[Sequence[object]], classes: Sequence[type]
-) -> list[object]:
-    """Returns the values that were stored column by column.
-
-    Args:
-        kind: the number of their class, `_TUPLE`, or the lengths of arrays.
-        columns: one for each attribute; all arrays, one after the other.
-        classes: of the kind of fragments.
-    """
-    if isinstance(kind, tuple):
-        edges = np.cumsum([0, *kind]).tolist()
-        return [columns[0][start:stop] for start, stop in pairwise(edges)]
-    if kind == _TUPLE:
-        return [*zip(*columns, strict=True)]
-    return [*map(classes[cast("int", kind)], *columns)]
-
-
-def _with_none(values: list[object], places: Sequence[int]) -> tuple[object, ...]:
-    """Returns values with None inserted at some places, which ascend."""
-    for nth in places:
-        values.insert(nth, None)
-    return tuple(values)
+    fragment = json.loads(head, object_hook=made)
+    if not isinstance(fragment, (*classes,)):
+        raise TypeError("it is no fragment of this kind")
+    return fragment
 
 
 def _pack_array(array: Array) -> tuple[str, float | None, bytes]:

@@ -110,9 +110,9 @@ def test_a_fragment_is_the_same_once_it_was_stored(whole: Whole) -> None:
 @given(st.lists(st.none() | st.integers(0, 400), min_size=1))
 def test_arrays_in_rows_are_the_same_once_they_were_stored(sizes: list[int | None]) -> None:
     stored = tuple(None if size is None else np.ones((size, 2)) * size for size in sizes)
-    found = from_bytes(to_bytes(stored, ()), ())
-    assert isinstance(found, tuple)
-    for array, back in zip(stored, found, strict=True):
+    found = from_bytes(to_bytes(Whole(None, b"", stored, {}), (Whole,)), (Whole,))
+    assert isinstance(found, Whole)
+    for array, back in zip(stored, found.rows, strict=True):
         np.testing.assert_array_equal(array, back)
 
 
