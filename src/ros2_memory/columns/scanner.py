@@ -383,7 +383,7 @@ class Scanner:
 
     def _table(self, head: PartHead, topic: Topic) -> StoredTable:
         """Returns the table of a part; its columns are unpacked when they are first used."""
-        packed = partial(self.packed, head, {LOG_TIME, BAG} | topic.layout.slots.keys())
+        packed = partial(self.packed, head, {LOG_TIME, BAG, *topic.layout.paths})
 
         def load(path: str) -> Column:
             column = packed(path)

@@ -28,32 +28,11 @@ class Step:
     per_unit: int = 0
     relative: bool = False
 
-    def __str__(self) -> str:
-        """Returns the step as text for a layout: `1/10000`, `relative`, `exact`."""
-        if self.per_unit:
-            return f"1/{self.per_unit}"
-        return "relative" if self.relative else "exact"
-
     def nearest(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the nearest multiples of an absolute step; a value too large for one stays."""
         with np.errstate(over="ignore", invalid="ignore"):
             multiples = np.rint(values * self.per_unit) / self.per_unit
         return np.where(np.isinf(multiples), values, multiples)
-
-    @classmethod
-    def parse(cls, text: str) -> Step:
-        """Returns the step of such a text.
-
-        Raises:
-            ValueError: the text is of no step.
-        """
-        if text == "relative":
-            return RELATIVE
-        if text == "exact":
-            return EXACT
-        if not text.startswith("1/"):
-            raise ValueError(f"no step is written {text!r}")
-        return cls(per_unit=int(text[2:]))
 
 
 EXACT: Final = Step()

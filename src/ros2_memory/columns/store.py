@@ -32,7 +32,6 @@ from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.writing import (
     BELOW,
     UNUSED_SUMMARIES,
-    Layouts,
     Level,
     LongBag,
     ReadBag,
@@ -205,7 +204,6 @@ class ColumnStore(Database):
         self._definition_of = definition_of
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
-        self._layouts = Layouts()
 
     # Reading
 
@@ -540,9 +538,7 @@ class ColumnStore(Database):
                 elif bag.is_current():
                     new[number] = bag
             delete_bags(connection, [bag.key.path for bag in new.values()])
-            ids = insert_bags(
-                connection, new, tables, self._definitions, self._layouts, level=level
-            )
+            ids = insert_bags(connection, new, tables, self._definitions, level)
             written = Written(stored + len(new), [self.offset + part for part in ids])
 
         return written if self.write(write) else Written(0, ())

@@ -11,15 +11,14 @@ while the store is filled, and remains when columns are dropped.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKind
-from ros2_memory.columns.steps import EXACT, Step, step_of
 from ros2_memory.columns.table import (
     IN_PART,
     Column,
@@ -31,38 +30,27 @@ from ros2_memory.columns.table import (
     letters_of,
     words_of,
 )
-from ros2_memory.core.arrays import Flags, Ints, numbered
+from ros2_memory.core.arrays import Flags, numbered
 from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from ros2_memory.columns.pack import Packed
     from ros2_memory.core.timebase import Span
     from ros2_memory.storage.base import Channel, Definition, IntArray
+    from ros2_memory.storage.cache import ByteLru
 
     Floats = NDArray[np.float64]
 
 
 _BYTES: Final = 500
 """About how much memory an entry takes."""
+_TOTALS_BYTES: Final = 600
+"""About how much memory the totals of a column take."""
 _MOST_LETTERS: Final = 1_024
 """Distinct runs of letters in the texts of a part; if there are more, the outline has none."""
 V = TypeVar("V")
-
-
-class ColumnKind(NamedTuple):
-    """The type of a column.
-
-    Attributes:
-        dtype: `text`, or numpy's name of it.
-        step: how exactly it is stored.
-    """
-
-    dtype: str
-    step: Step = EXACT
 
 
 @dataclass(frozen=True)
@@ -70,27 +58,26 @@ class Layout:
     """The columns of the tables of one topic, type and definition.
 
     Attributes:
-        slots: the kinds of all columns, by their paths from the table, in the order in which they
-            are packed: the columns of the messages; then for each sequence the owners of its
-            elements, whose path ends with `#`, and their columns (`detections.label`).
+        paths: of all columns, from the table, in the order in which they are packed: the columns of
+            the messages; then for each sequence the owners of its elements, whose path ends with
+            `#`, and their columns (`detections.label`).
         left_out: why fields have no column; see `Table.left_out`.
     """
 
-    slots: Mapping[str, ColumnKind]
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    paths: tuple[str, ...]
+    left_out: Mapping[str, str]
 
     @classmethod
-    def of(cls, table: Table, definition: Definition | None) -> Layout:
-        """Returns the layout of a table; the definition determines the steps."""
-        kinds = {path: _kind_of(column, path, definition) for path, column in columns_in(table)}
-        return cls(kinds, table.left_out)
+    def of(cls, table: Table) -> Layout:
+        """Returns the layout of a table."""
+        return cls(tuple(path for path, _ in columns_in(table)), table.left_out)
 
     @cached_property
     def levels(self) -> dict[str, LevelPaths]:
         """The columns of the messages (""), and of the elements of each sequence by its path."""
         levels = {"": LevelPaths({}, {})}
         sequence = ""
-        for path in self.slots:
+        for path in self.paths:
             if path.endswith("#"):
                 sequence = path[:-1]
                 parent = max(
@@ -103,18 +90,9 @@ class Layout:
                 levels[sequence].columns[name] = path
         return levels
 
-    def fits(self, table: Table) -> bool:
-        """Returns whether a table has exactly these columns, and leaves out the same fields."""
-        paths = [path for path, _ in columns_in(table)]
-        return self.left_out == table.left_out and paths == [*self.slots]
-
     def to_json(self) -> str:
         """Returns the layout as readable JSON; that of equal layouts is equal."""
-        columns = {
-            path: kind.dtype if kind.step == EXACT else f"{kind.dtype} {kind.step}"
-            for path, kind in self.slots.items()
-        }
-        described = {"columns": columns, "left_out": dict(self.left_out)}
+        described = {"columns": self.paths, "left_out": dict(self.left_out)}
         return json.dumps(described, ensure_ascii=False)
 
     @classmethod
@@ -125,15 +103,11 @@ class Layout:
             ValueError, LookupError, TypeError: the text is no layout.
         """
         described = json.loads(text)
-        slots = {}
-        for path, words in dict(described["columns"]).items():
-            dtype, _, step = str(words).partition(" ")
-            slots[path] = ColumnKind(dtype, Step.parse(step) if step else EXACT)
-        return cls(slots, described["left_out"])
+        return cls(tuple(described["columns"]), described["left_out"])
 
 
 class LevelPaths(NamedTuple):
-    """The paths in `Layout.slots` of the fields of messages, or of elements of a sequence.
+    """The paths in `Layout.paths` of the fields of messages, or of elements of a sequence.
 
     Attributes:
         columns: by the names of the columns.
@@ -145,29 +119,12 @@ class LevelPaths(NamedTuple):
 
 
 def columns_in(rows: Table | Elements, around: str = "") -> Iterator[tuple[str, Column]]:
-    """Yields all columns of a table with their paths, in the order of `Layout.slots`."""
+    """Yields all columns of a table with their paths, in the order of `Layout.paths`."""
     for name, column in rows.columns.items():
         yield f"{around}{name}".rstrip("."), column
     for name, inner in rows.elements.items():
         yield f"{around}{name}#", inner.owners
         yield from columns_in(inner, f"{around}{name}.")
-
-
-def _kind_of(column: Column, path: str, definition: Definition | None) -> ColumnKind:
-    if isinstance(column, Texts):
-        return ColumnKind("text")
-    name = column.dtype.name
-    return ColumnKind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
-
-
-class Memory(Protocol):
-    """A cache that forgets values when it is full."""
-
-    def get(self, key: Hashable) -> object | None:
-        """Returns the value of a key; None if it was forgotten."""
-
-    def put(self, key: Hashable, value: object, size: int) -> None:
-        """Remembers a value of about `size` bytes."""
 
 
 class LazyMapping(Mapping[str, V]):
@@ -201,16 +158,16 @@ class StoredTable(Table):
     """The table of a part, whose columns are unpacked when they are first used, by any thread.
 
     Attributes:
-        packed: returns how the column at a path of `Layout.slots` is packed, without its data; None
+        packed: returns how the column at a path of `Layout.paths` is packed, without its data; None
             if there is no such column.
         outline: returns the outline of the part; None if it was not made.
-        memory: remembers what is made of the part; None to remember nothing.
+        memory: remembers what is made of the part.
         number: of the part.
     """
 
     packed: Callable[[str], Packed | None] = field(kw_only=True)
     outline: Callable[[], Outline | None] = field(kw_only=True, default=lambda: None)
-    memory: Memory | None = field(kw_only=True, default=None)
+    memory: ByteLru[object] = field(kw_only=True)
     number: int = field(kw_only=True, default=0)
 
     def error(self, path: str) -> float:
@@ -234,8 +191,6 @@ class StoredTable(Table):
 
     def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
         """Returns what `make` returns, once for the part; see `Table.remember`."""
-        if self.memory is None:
-            return make()
         key = (self.number, f"={what}")
         cached = self.memory.get(key)
         if cached is not None:
@@ -272,7 +227,7 @@ def lazy_columns(
 
     Args:
         layout: of the table.
-        column: returns the column at a path of `Layout.slots`.
+        column: returns the column at a path of `Layout.paths`.
         dropped: the paths of the columns that were dropped.
         sequence: the path of the sequence whose elements have the columns; "" for the messages.
     """
@@ -347,39 +302,17 @@ class Outline(NamedTuple):
     """What is known of some columns of a part.
 
     Attributes:
-        paths: of the columns of numbers.
-        sizes: `Totals.size` of each.
-        sums: `Totals.total` of each.
-        times: `Totals.least` and `Totals.greatest` of each (N x 4).
+        totals: of columns of numbers, by their paths.
         letters: of columns of texts, by their paths.
     """
 
-    paths: Sequence[str]
-    sizes: IntArray
-    sums: Floats
-    times: Ints
+    totals: Mapping[str, Totals]
     letters: Mapping[str, Letters]
-
-    @classmethod
-    def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
-        """Returns the outline of columns, by their paths."""
-        sizes, sums, least, greatest = zip(*totals.values(), strict=True) if totals else ((),) * 4
-        ends = np.array([*zip(least, greatest, strict=True)], np.int64).reshape(-1, 4)
-        return cls([*totals], np.array(sizes, np.int64), np.array(sums, float), ends, letters)
-
-    def totals(self, path: str) -> Totals | None:
-        """Returns the totals of a column of numbers; None if they are not known."""
-        if path not in self.paths:
-            return None
-        nth = self.paths.index(path)
-        least, least_until, greatest, greatest_until = self.times[nth].tolist()
-        size, total = int(self.sizes[nth]), float(self.sums[nth])
-        return Totals(size, total, (least, least_until), (greatest, greatest_until))
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        size = _BYTES + 120 * len(self.paths)
+        size = _BYTES + _TOTALS_BYTES * len(self.totals)
         for letters in self.letters.values():
             size += letters.has.nbytes + 100 * len(letters.words)
         return size
@@ -407,7 +340,7 @@ def outline_of(table: Table, times: IntArray) -> Outline:
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
                 totals[path] = _totals_of(column, table.error(path), times)
-    return Outline.of(totals, letters)
+    return Outline(totals, letters)
 
 
 def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
@@ -426,4 +359,4 @@ def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
     return Totals(len(numbers), total, *spans)
 
 
-OUTLINE: Final[FragmentKind[Outline]] = FragmentKind("outline", (Outline, Letters))
+OUTLINE: Final[FragmentKind[Outline]] = FragmentKind("outline", (Outline, Totals, Letters))

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.pack import Packed, compress, pack
+from ros2_memory.columns.steps import step_of
 from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.arrays import run_starts
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.store import BagKey
     from ros2_memory.core.model import BagFile
-    from ros2_memory.storage.base import IntArray, Schema
+    from ros2_memory.storage.base import IntArray
 
 PART_NS: Final[Ns] = 3600 * NS_PER_S
 """Bags of one recording that begin in the same hour become one part for each topic."""
@@ -59,7 +60,6 @@ _MOST_ROWS: Final = 24_576
 BELOW: Final = "SELECT value FROM part, json_each(part.bags) WHERE level < ?"
 """Selects the bags that have parts below a level."""
 _MOST_INTEGER: Final = 2**63 - 1
-_MOST_LAYOUTS: Final = 4_096
 
 LOG_TIME: Final = "#log_time"
 PUBLISH_TIME: Final = "#publish_time"
@@ -107,11 +107,10 @@ class PackedPart:
         return sum(map(len, self.path_of_data))
 
 
-def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
+def pack_rows(table: Table, bags: IntArray) -> PackedPart:
     """Returns the rows of a table as a part.
 
     Args:
-        layout: of the table.
         table: the rows.
         bags: the number of each row's bag.
     """
@@ -125,7 +124,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
     for path, column in columns_in(table):
-        packed[path] = pack(column, layout.slots[path].step)
+        packed[path] = pack(column, step_of(path, table.definition))
     for path, whole in packed.items():
         if whole.data:
             packed[path] = replace(whole, data=compress(whole.data))
@@ -168,7 +167,6 @@ class LongBag:
         self._lacks_definitions = False
         self._number = 0
         self._connection: sqlite3.Connection | None = None
-        self._layouts = Layouts()
 
     def begin(self, connection: sqlite3.Connection) -> bool:
         """Inserts the bag in place of one with its path; a size of -1 marks it as unfinished."""
@@ -187,10 +185,10 @@ class LongBag:
         self._lacks_definitions |= any(map(lacks_definitions, tables))
         parts: list[int] = []
         for table in filter(len, tables):
-            topic, layout = topic_of(connection, table, self._layouts)
+            topic = topic_of(connection, table)
             for hour in _split_by_hour(table):
                 for rows in _split_by_size(hour):
-                    part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
+                    part = pack_rows(rows, np.full(len(rows), self._number, np.int64))
                     parts.append(_insert_part(connection, topic, part, Level.HOUR))
         share = round(self._share * sum(map(len, tables)))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
@@ -343,8 +341,6 @@ def insert_bags(
     bags: Mapping[int, ReadBag],
     tables: Sequence[Table],
     definitions: str,
-    layouts: Layouts,
-    *,
     level: Level,
 ) -> list[int]:
     """Inserts bags of one recording, in parts for each topic; returns the ids of the parts.
@@ -355,7 +351,6 @@ def insert_bags(
         tables: all messages of these bags, a table for each topic and layout. Rows of other bags
             are left out.
         definitions: as `ColumnStore` has them.
-        layouts: remembers layouts.
         level: of the parts.
     """
     lacking: set[int] = set()
@@ -368,10 +363,10 @@ def insert_bags(
     for table in tables:
         is_stored = np.isin(table.bag_numbers, [*bags])
         if is_stored.any():
-            topic, layout = topic_of(connection, table, layouts)
+            topic = topic_of(connection, table)
             rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
             for piece in _split_by_size(rows):
-                part = pack_rows(layout, piece, ids[piece.bag_numbers])
+                part = pack_rows(piece, ids[piece.bag_numbers])
                 parts.append(_insert_part(connection, topic, part, level))
     return parts
 
@@ -424,40 +419,21 @@ def zone_of(
     return Zone(least, greatest, nulls, words)
 
 
-class Layouts:
-    """Remembers layouts by schema and by the fields that are left out, which determine them."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[Schema, tuple[tuple[str, str], ...]], Layout] = {}
-
-    def of(self, table: Table) -> Layout:
-        """Returns the layout of a table."""
-        key = (table.channel.schema, tuple(sorted(table.left_out.items())))
-        layout = self._known.get(key)
-        if layout is None or not layout.fits(table):
-            layout = self._known[key] = Layout.of(table, table.definition)
-            if len(self._known) > _MOST_LAYOUTS:
-                del self._known[next(iter(self._known))]
-        return layout
-
-
-def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
-    """Returns the id of a table's topic, which is inserted if it is new, and its layout."""
-    channel, layout = table.channel, layouts.of(table)
-    schema = channel.schema
+def topic_of(connection: sqlite3.Connection, table: Table) -> int:
+    """Returns the id of a table's topic, which is inserted if it is new."""
+    channel, schema = table.channel, table.channel.schema
     definition = _find_or_insert(
         connection, "definition", type=schema.name, encoding=schema.encoding, text=schema.text
     )
-    topic = _find_or_insert(
+    return _find_or_insert(
         connection,
         "topic",
         name=channel.topic,
         encoding=channel.encoding,
         latched=channel.latched,
         definition=definition,
-        layout=layout.to_json(),
+        layout=Layout.of(table).to_json(),
     )
-    return topic, layout
 
 
 def _find_or_insert(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:

@@ -268,7 +268,7 @@ class PieceNumbers:
         path, outline = self._columns[key], table.outline()
         if path is None or outline is None:
             return None
-        totals, zone = outline.totals(path), table.zone(path)
+        totals, zone = outline.totals.get(path), table.zone(path)
         if totals is None or zone is None or not math.isfinite(totals.total):
             return None
         least = Extreme(zone.low, zone.low, *totals.least)

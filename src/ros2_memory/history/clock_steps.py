@@ -210,7 +210,7 @@ def _stamps_by_recording(view: View, topic: str, window: TimeWindow) -> dict[Pat
     by_recording: dict[Path, list[Ints]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
-        return _STAMP in parts.topic.layout.slots
+        return _STAMP in parts.topic.layout.paths
 
     def read_stamps(rows: Rows) -> Ints | None:
         column = rows.table.columns.get(_STAMP)

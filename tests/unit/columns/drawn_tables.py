@@ -31,6 +31,7 @@ from ros2_memory.columns.stored import Layout, StoredTable, columns_in, lazy_col
 from ros2_memory.columns.table import Column, Table, Texts
 from ros2_memory.core.model import JsonValue
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
 
@@ -210,8 +211,8 @@ def stored(table: Table, step: float) -> Stored:
         return columns[path]
 
     made = {each.name: getattr(table, each.name) for each in fields(Table)}
-    made["columns"], made["elements"] = lazy_columns(Layout.of(table, None), load, ())
-    return Stored(**made, packed=packed.get, unpacked=unpacked)
+    made["columns"], made["elements"] = lazy_columns(Layout.of(table), load, ())
+    return Stored(**made, packed=packed.get, unpacked=unpacked, memory=ByteLru(0))
 
 
 def rounded(numbers: Any, step: float) -> Any:

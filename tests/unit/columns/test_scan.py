@@ -147,7 +147,7 @@ def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Pat
     world.fill_alone([first])
 
     def may_say(parts: PartZones) -> bool:
-        return "data" in parts.topic.layout.slots
+        return "data" in parts.topic.layout.paths
 
     opened = open_scan(View(world.memory, Call()), "/chatter", EVERYTHING, may_match=may_say)
     store_file(tmp_path).unlink()

@@ -52,7 +52,7 @@ def as_part(table: Table) -> PartZones:
         known = Zones.of([], []) if zone is None else Zones.of([0], [zone])
         return known.among(np.zeros(1, np.int64))
 
-    layout = Layout.of(table, table.definition)
+    layout = Layout.of(table)
     topic = Topic(table.channel, layout, lambda _: table.definition)
     return PartZones(topic, np.zeros(1, np.int64), zones)
 
