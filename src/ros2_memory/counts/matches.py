@@ -323,12 +323,15 @@ def _flag_spans(
     end = held_until(binned.view, topic, last, max(last, binned.window.stop), or_rare=True)
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
     gaps = _gaps_for_topic(binned, topic)
-    spans: list[_HeldSpan] = []
-    for nth, ((since, holds), (stop, _)) in enumerate(pairwise([*changes, (end, False)])):
-        if holds:
-            # What holds at first may have begun before the window.
-            spans += _without_gaps(_HeldSpan(since, stop, nth > 0), gaps)
-    return _without_silences(binned, topic, spans)
+    # What holds at first may have begun before the window, and what holds after a gap in it.
+    unsure = {start for start, _ in changes[:1]}.union(stop for _, stop in gaps)
+    spans = [
+        _HeldSpan(since, stop, since not in unsure)
+        for (since, holds), (stop, _) in pairwise([*changes, (end, False)])
+        if holds
+    ]
+    unheard = united([*gaps, *_silences(binned, topic, spans)])
+    return [part for span in spans for part in _heard_parts(span, unheard)]
 
 
 def _flag_states(
@@ -389,30 +392,11 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     return spans_of(begins, heard_again)
 
 
-def _without_gaps(span: _HeldSpan, gaps: Sequence[Span]) -> list[_HeldSpan]:
-    """Returns the parts of a span outside of gaps; a part after a gap is not known to begin."""
-    start, stop, is_begun = span
-    parts: list[_HeldSpan] = []
-    first = bisect_left(gaps, start, key=itemgetter(1))
-    for begin, end in gaps[first : bisect_left(gaps, stop, key=itemgetter(0))]:
-        # The last message before a gap may toggle: that span has no length.
-        if begin > start or (begin == start and is_begun):
-            parts.append(_HeldSpan(start, begin, is_begun))
-        start, is_begun = end, False
-    if start < stop or not parts:
-        parts.append(_HeldSpan(start, stop, is_begun))
-    return parts
-
-
-def _without_silences(binned: BinnedWindow, topic: str, spans: list[_HeldSpan]) -> list[_HeldSpan]:
-    """Returns the parts of spans, in order, in which the topic was heard.
-
-    All, if what the topic says holds through silences. A toggle in the first message after a
-    silence begins there.
-    """
+def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Spans:
+    """Returns the silences of a topic in some spans; none, if what it says holds through them."""
     long = [span for span in spans if span.stop - span.start > SILENCE_NS]
     if not long or holds_on(binned.view, (topic,)):
-        return spans
+        return []
     window = TimeWindow(long[0].start, long[-1].stop + 1)
     heard = heard_times(binned.view, (topic,), window)
     between = (
@@ -421,13 +405,22 @@ def _without_silences(binned: BinnedWindow, topic: str, spans: list[_HeldSpan]) 
         if window.contains(last - 1)  # outside of the window not every message is heard
     )
     # A thinned day has one message of a measurement a minute.
-    silences = without(between, binned.view.timeline.thinned_times)
+    return without(between, binned.view.timeline.thinned_times)
+
+
+def _heard_parts(span: _HeldSpan, unheard: Spans) -> list[_HeldSpan]:
+    """Returns the parts of a span in which the topic was heard; the first alone may begin there."""
+    start, stop, is_begun = span
     parts: list[_HeldSpan] = []
-    for span in spans:
-        parts += [
-            part._replace(is_begun=span.is_begun and part.start == span.start)
-            for part in _without_gaps(span._replace(is_begun=True), silences)
-        ]
+    first = bisect_left(unheard, start, key=itemgetter(1))
+    for begin, end in unheard[first : bisect_left(unheard, stop, key=itemgetter(0))]:
+        # The last message before a silence may toggle: that part has no length.
+        if begin >= start:
+            parts.append(_HeldSpan(start, begin, is_begun))
+            is_begun = False
+        start = end
+    if start < stop or not parts:
+        parts.append(_HeldSpan(start, stop, is_begun))
     return parts
 
 
