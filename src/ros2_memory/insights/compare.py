@@ -236,7 +236,7 @@ def _side_of(view: View, window: TimeWindow) -> _Side:
         is_recorded,
         drive,
         known_placement(view),
-        _path_numbers(drive, window),
+        _path_numbers(drive),
         _error_counts(view, window),
         _silent_seconds(view, window),
         unix_from_ns(drive.elapsed.between(*window.asked())),
@@ -499,18 +499,16 @@ def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
     return -seen.end, thing.label
 
 
-def _path_numbers(drive: Drive, window: TimeWindow) -> dict[str, float | None]:
+def _path_numbers(drive: Drive) -> dict[str, float | None]:
     """Returns the numbers of a path by the names in `_LEAST`; None for an unknown number."""
-    trajectory = drive.valid_trajectory
+    trajectory, stood = drive.valid_trajectory, drive.stood
     if trajectory is None:
         return dict.fromkeys(_LEAST)
-    start, end = window.asked()
-    stood = drive.stood(end - start)
     return {
         "distance_m": trajectory.totals.distance_m,
         "max_speed": trajectory.max_speed,
         "stood_s": None if stood is None else unix_from_ns(stood),
-        "standstills": None if stood is None else float(len(drive.stops(end - start))),
+        "standstills": None if stood is None else float(len(drive.stops)),
     }
 
 

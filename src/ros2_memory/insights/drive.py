@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import merge
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import across_steps
 from ros2_memory.analysis.motion.standstills import (
@@ -35,7 +35,6 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     START_SLACK_NS,
     Ns,
-    Span,
     ns_from_unix,
     unix_from_ns,
 )
@@ -64,37 +63,23 @@ _MOST_MISSING: Final = 0.1
 """If poses are missing for more of the recorded time, how long the robot stood is unknown."""
 
 
-class Stop(NamedTuple):
-    """The part of a standstill in a window, and whether it goes on after the window."""
-
-    standstill: Standstill
-    goes_on: bool
-
-    @property
-    def length(self) -> Ns:
-        """How long the part in the window lasts (ns)."""
-        return self.standstill.end - self.standstill.start
-
-    @property
-    def span(self) -> Span:
-        """The first and the last time (ns) of the part."""
-        return self.standstill.start, self.standstill.end
-
-
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """How the robot moved: its path, and its standstills.
+    """How the robot moved in a window: its path, and its standstills.
 
     Attributes:
+        length: of the window (ns).
         elapsed: tells how much time passed between two moments of the window.
+        standstills: the parts of standstills in the window.
         drops: sudden losses of speed that no standstill follows.
         recorded: for how long (ns) anything was recorded since the path is known.
     """
 
+    length: Ns
     elapsed: Elapsed
     path: PathSlice | None = None
     trajectory: Trajectory | None = None
-    standstills: tuple[Stop, ...] = ()
+    standstills: tuple[Standstill, ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     recorded: Ns = 0
 
@@ -104,19 +89,21 @@ class Drive:
         trajectory = self.trajectory
         return trajectory if trajectory is not None and trajectory.is_known else None
 
-    def stops(self, length: Ns) -> tuple[Stop, ...]:
-        """Returns the standstills that a window lists; `length` is the window's (ns).
+    @property
+    def stops(self) -> list[Standstill]:
+        """The standstills that the window lists.
 
         They fill the window, or last half of the shortest standstill in it. So at least one of two
         consecutive windows lists a standstill across their bound, and none lists its last moment.
         """
-        least = min(SHORTEST_NS // 2, length)
-        return tuple(stop for stop in self.standstills if stop.length >= least)
+        least = min(SHORTEST_NS // 2, self.length)
+        return [stop for stop in self.standstills if stop.length >= least]
 
-    def stood(self, length: Ns) -> Ns | None:
-        """Returns how long (ns) the robot stood in a window; None if that is unknown.
+    @property
+    def stood(self) -> Ns | None:
+        """How long (ns) the robot stood in the window; None if that is unknown.
 
-        It is unknown in these cases, where `length` is the window's (ns):
+        It is unknown in these cases:
 
         - No pose has a valid position.
         - Poses are too far apart to show standstills.
@@ -136,14 +123,15 @@ class Drive:
         moving_s = recorded_s - unix_from_ns(stood)
         is_slow = moving_s > recorded_s / 2 and trajectory.totals.distance_m <= CREEP_MPS * moving_s
         # A window without a standstill may begin and end beyond its poses.
-        lasted = ns_from_unix(moving_s) if stood else length
+        lasted = ns_from_unix(moving_s) if stood else self.length
         is_hidden = is_slow and lasted >= SHORTEST_NS and not (stood and trajectory.totals.gaps)
         return None if is_hidden else stood
 
 
 def drive_in(view: View, window: TimeWindow) -> Drive:
     """Returns how the robot moved in a window. If that is unknown, a note says why."""
-    elapsed = elapsed_in(view, window)
+    elapsed, (start, end) = elapsed_in(view, window), window.asked()
+    unknown = Drive(end - start, elapsed)
     try:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
@@ -152,13 +140,14 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         standstills, drops = _stops_and_drops(view, topic, TimeWindow(begin, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
-        return Drive(elapsed)
+        return unknown
+    stands = replace(unknown, standstills=standstills, drops=drops)
     if path is None:
         is_twice = any(pair.is_twice for pair in parallel_or_twice(view, topic, window))
         which = " that count" if is_twice else ""
         elsewhere = describe_earlier_poses(view, topic, window.stop)
         view.notes.add(f"{topic} has no poses in this time{which}: the path is unknown{elsewhere}")
-        return Drive(elapsed, None, None, standstills, drops)
+        return stands
     trajectory = across_steps(with_runs(view, topic, path, path.trajectory(0)), path, elapsed)
     window = TimeWindow(begin, window.stop)
     (start, end), gaps = shown_span(view.snapshot, window), [*recording_gaps(view, window)]
@@ -167,12 +156,12 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     long = [span_text(*span) for span in beyond if span[1] - span[0] > NEWEST_POSE_NS]
     if long:
         view.notes.add(f"{topic} has no poses from {listed(long)}: the path is without that time")
-    return Drive(elapsed, path, trajectory, standstills, drops, recorded)
+    return replace(stands, path=path, trajectory=trajectory, recorded=recorded)
 
 
 def _stops_and_drops(
     view: View, topic: str, window: TimeWindow
-) -> tuple[tuple[Stop, ...], tuple[SpeedDrop, ...]]:
+) -> tuple[tuple[Standstill, ...], tuple[SpeedDrop, ...]]:
     """Returns the standstills and the sudden losses of speed in a window, each in order.
 
     Poses outside of the window count too. A standstill across a bound of the window ends there,
@@ -201,11 +190,13 @@ def _stops_and_drops(
     stops = []
     for standstill in standstills:
         if standstill.start < end and standstill.end > start:
-            part = standstill._replace(
-                start=max(standstill.start, start), end=min(standstill.end, end)
-            )
             is_newest = standstill.end == last and not was_recorded_later
-            stops.append(Stop(part, standstill.end > end or is_newest))
+            part = standstill._replace(
+                start=max(standstill.start, start),
+                end=min(standstill.end, end),
+                goes_on=standstill.end > end or is_newest,
+            )
+            stops.append(part)
     return tuple(stops), tuple(drops)
 
 

@@ -44,7 +44,7 @@ from ros2_memory.insights.changes_before import (
     changes_in,
     recap_before,
 )
-from ros2_memory.insights.drive import Drive, Stop, drive_in
+from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.silences import group_silences, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import (
     GoalRun,
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.stays import Stay
@@ -167,7 +168,7 @@ def recap(
     things = _things_in_view(
         view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
-    stops = _stops_inside(drive.stops(end - start), region_stays)
+    stops = _stops_inside(drive.stops, region_stays)
     goals = goals_in(view, window, events_of_topics)
     events = [
         *_stop_events(nsmallest(most_events, stops, key=lambda stop: -stop.length), places),
@@ -198,7 +199,7 @@ def recap(
         now=memory.now(view.snapshot.latest, view.call),
         distance_m=None,
         max_speed=None,
-        stood=_standing_time(view, drive, end - start),
+        stood=_standing_time(view, drive),
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
         throughout=tuple(sorted(things.throughout)),
@@ -213,9 +214,9 @@ def recap(
     return replace(answer, notes=view.notes.sentences())
 
 
-def _standing_time(view: View, drive: Drive, length: Ns) -> Ns | None:
-    """Returns how long the robot stood in a window of a length (ns); if unknown, a note says so."""
-    stood = drive.stood(length)
+def _standing_time(view: View, drive: Drive) -> Ns | None:
+    """Returns how long the robot stood (ns); if that is unknown, a note says so."""
+    stood = drive.stood
     if stood is None and drive.valid_trajectory is not None:
         view.notes.add(
             "positions are too noisy, too few or missing for too long to detect standstills: "
@@ -251,7 +252,7 @@ class _RegionStays:
         is_inside = any(stay.start <= start and end <= stay.stop for stay in self.stays)
         return not is_inside and self.overlaps(start, end)
 
-    def standing_time(self, stops: Iterable[Stop]) -> Ns:
+    def standing_time(self, stops: Iterable[Standstill]) -> Ns:
         """Returns how long (ns) the robot stood during the stays."""
         spans: Spans = []
         for stop in stops:
@@ -447,17 +448,18 @@ def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
-def _stops_inside(stops: Sequence[Stop], region_stays: _RegionStays | None) -> Sequence[Stop]:
+def _stops_inside(
+    stops: Sequence[Standstill], region_stays: _RegionStays | None
+) -> Sequence[Standstill]:
     """Returns the stops that overlap a stay in the region; all without a region."""
     if region_stays is None:
         return stops
     return [stop for stop in stops if region_stays.overlaps(*stop.span)]
 
 
-def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:
+def _stop_events(stops: Iterable[Standstill], places: RobotPlaces | None) -> Iterator[Event]:
     """Yields stops with the point where the robot stood, in the frame of places if it is known."""
-    for stop in stops:
-        start, end, box = stop.standstill
+    for start, end, box, goes_on in stops:
         x, y, _ = box.centre
         point: tuple[float, float] | None = (x, y)
         frame = ""
@@ -469,7 +471,7 @@ def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[
                 x, y = point
         # z: a rounded -0.00 reads as 0.00.
         text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
-        yield Event("stop", start, end, text, stop.goes_on, point=point)
+        yield Event("stop", start, end, text, goes_on, point=point)
 
 
 def _errors_in_region(

@@ -310,13 +310,13 @@ class RowMaker:
             return driven, []
         stands, events = stands_of(poses, MIN_NS, MAX_NS), list[Row]()
         standstills = standstills_of([stands.blocks])
-        for start, end, box in standstills:
-            x, y, _ = box.centre
-            events.append(_event(topic, "stop", start, "stood", last_ns=end, x=x, y=y))
+        for stop in standstills:
+            x, y, _ = stop.box.centre
+            events.append(_event(topic, "stop", stop.start, "stood", last_ns=stop.end, x=x, y=y))
         for time, before_mps, after_mps in stands.drops:
             text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
             events.append(_event(topic, "drop", time, text, value=before_mps - after_mps))
-        stood_ns = sum(stop.end - stop.start for stop in standstills)
+        stood_ns = sum(stop.length for stop in standstills)
         return {**driven, "stood_s": unix_from_ns(stood_ns)}, events
 
     def _channels(self, bag: BagFile) -> Iterator[Row]:

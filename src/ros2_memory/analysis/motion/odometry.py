@@ -195,32 +195,26 @@ class Leg(NamedTuple):
     def joined(self, later: Leg) -> Leg:
         """Returns this leg and a later one, which continues it without a break, as one."""
         step_m = math.dist(self.last.position, later.first.position)
-        if (self.poses < FEWEST) == (later.poses < FEWEST):
-            extent = self._linked(later, step_m)
-        else:
-            extent = self._bridged(later, step_m)
+        are_alike = (self.poses < FEWEST) == (later.poses < FEWEST)
+        measured = (self._linked if are_alike else self._bridged)(later, step_m)
         longer, shorter = (self, later) if self.poses >= later.poses else (later, self)
         near_first, near_last = self.near_first, later.near_last
         if self.poses <= _NEARBY:
             near_first = near_first.or_more(later.near_first)
         if later.poses <= _NEARBY:
             near_last = near_last.or_more(self.near_last)
-        return Leg(
+        return measured._replace(
             first=self.first,
             last=later.last,
             poses=self.poses + later.poses,
             period_ns=longer.period_ns or shorter.period_ns,
-            length_m=extent.length_m,
             sum_m=self.sum_m + step_m + later.sum_m,
-            head=extent.head,
-            tail=extent.tail,
-            still=extent.still,
             near_first=near_first,
             near_last=near_last,
         )
 
-    def _linked(self, later: Leg, step_m: float) -> _Extent:
-        """Returns the extent of two legs whose noise is known in both, or in neither."""
+    def _linked(self, later: Leg, step_m: float) -> Leg:
+        """Returns this leg with the length and the ends of both; noise is known in both, or none."""
         head, tail, length_m = self.head, later.tail, self.length_m + later.length_m
         before, after = self.tail.creep, later.head.creep
         if before is not None and after is not None:
@@ -231,19 +225,20 @@ class Leg(NamedTuple):
                 tail = tail._replace(creep=creep)
             if not (self.still or later.still):
                 length_m += creep.length_m
-            return _Extent(head, tail, length_m, self.still and later.still)
+            still = self.still and later.still
+            return self._replace(head=head, tail=tail, length_m=length_m, still=still)
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
         # A creep that filled its leg reaches only one end of the whole.
         if before is not None and not self.still:
             inner_m += before.length_m
         if after is not None and not later.still:
             inner_m += after.length_m
-        return _Extent(head, tail, length_m + inner_m, False)
+        return self._replace(head=head, tail=tail, length_m=length_m + inner_m, still=False)
 
-    def _bridged(self, later: Leg, step_m: float) -> _Extent:
-        """Returns the extent of two legs, one of which has too few poses to estimate its noise.
+    def _bridged(self, later: Leg, step_m: float) -> Leg:
+        """Returns the longer of two legs with the length of both; its ends stay the ends.
 
-        The ends of the other one stay the ends of both.
+        The shorter one has too few poses to estimate its noise.
         """
         if later.poses < FEWEST:
             net_m = math.dist(self.last.position, later.last.position)
@@ -252,16 +247,7 @@ class Leg(NamedTuple):
             net_m = math.dist(self.first.position, later.first.position)
             end, short, long = later.head, self, later
         added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
-        return _Extent(long.head, long.tail, long.length_m + added_m, long.still)
-
-
-class _Extent(NamedTuple):
-    """The ends and the length of a leg; see `Leg`."""
-
-    head: End
-    tail: End
-    length_m: float
-    still: bool
+        return long._replace(length_m=long.length_m + added_m)
 
 
 def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
@@ -385,9 +371,7 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         are_enough = len(earlier) + len(later) >= _NEARBY
         near = _motion_of(earlier).or_more(_motion_of(later)) if are_enough else None
         here, there = earlier[-1], later[0]
-        leg_before = motion.totals.newest
-        usual_ns = _usual_ns(apart, index, None if leg_before is None else leg_before.period_ns)
-        kind = link(here, there, usual_ns, fastest_mps, near)
+        kind = link(here, there, _usual_ns(apart, index), fastest_mps, near)
         if kind == "driven":
             continue
         measured_leg = _measured_leg(times[begin : index + 1], positions[begin : index + 1])
@@ -559,14 +543,14 @@ class Motion:
             totals.resets = (*totals.resets, after.time)[:_MAX_RESETS]
 
 
-def _usual_ns(apart: Ints, index: int, known: Ns | None) -> Ns:
+def _usual_ns(apart: Ints, index: int) -> Ns:
     """Returns the usual time (ns) between poses around one interval.
 
-    It is the median of the intervals beside it. Without any, it is `known` or the interval itself.
+    It is the median of the intervals beside it; the only interval is as long as usual.
     """
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
     own_ns = near.pop(min(index, _NEARBY))
-    return median_low(near or [known or own_ns])
+    return median_low(near or [own_ns])
 
 
 def are_places(positions: Vectors) -> Flags:

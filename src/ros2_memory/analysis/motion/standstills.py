@@ -56,10 +56,10 @@ from ros2_memory.core.arrays import (
     run_starts,
     stacked,
 )
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, unix_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,7 +107,7 @@ _OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
 PER_METRE: Final = 10_000
 """Means of positions are rounded, so that the order of their sums does not matter."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
-_BLOCKS_AT_ONCE: Final = 128
+
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
 """How far drift alone spreads the means of a block."""
 
@@ -143,14 +143,25 @@ class Box3(NamedTuple):
 
 
 class Standstill(NamedTuple):
-    """A standstill, from the first pose to the last (log times, inclusive).
+    """A standstill, from the first pose to the last (log times, inclusive), or a part of one.
 
-    `box` is the box around the mean positions of its slots.
+    `box` is the box around the mean positions of its slots. If it `goes_on`, it did not end then.
     """
 
     start: Ns
     end: Ns
     box: Box3
+    goes_on: bool = False
+
+    @property
+    def length(self) -> Ns:
+        """How long it lasts (ns)."""
+        return self.end - self.start
+
+    @property
+    def span(self) -> Span:
+        """Its first and its last time (ns)."""
+        return self.start, self.end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -485,7 +496,9 @@ def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
         if box.diagonal <= DRIFTED_M:
             stands.append(Standstill(start, end, box))
         else:
-            stands += _split_by_drift(corners, firsts[begin:stop], begin, start, end)
+            blocks_of_run = np.arange(begin, stop)
+            boxes = _boxes(corners, blocks_of_run, blocks_of_run + 1)
+            stands += _split_by_drift(boxes, firsts[begin:stop], start, end)
         newest_end = stands[-1].end
     return tuple(stands)
 
@@ -510,34 +523,28 @@ def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
 
 
 def _split_by_drift(
-    corners: tuple[Vectors, Vectors], firsts: Ints, first: int, start: Ns, end: Ns
+    boxes: Iterable[Box3], firsts: Ints, start: Ns, end: Ns
 ) -> Iterator[Standstill]:
     """Yields the standstills of a run of still blocks that drifts out of `DRIFTED_M`.
 
     Args:
-        corners: the corners (m) of all blocks.
-        firsts: the log times (ns) of the first poses of the blocks in the run.
-        first: the index of the first block of the run.
+        boxes: the boxes of the blocks.
+        firsts: the log times (ns) of the first poses of the blocks.
         start: the log time (ns) at which the run begins.
         end: the log time (ns) at which it ends.
     """
-    lows, highs = (corner[first : first + firsts.size] for corner in corners)
-    begin = 0
-    while begin < firsts.size:
-        count = _BLOCKS_AT_ONCE
-        while True:
-            low = np.minimum.accumulate(lows[begin : begin + count])
-            high = np.maximum.accumulate(highs[begin : begin + count])
-            fits = int((_lengths(high - low) <= DRIFTED_M).sum())
-            if fits < count or begin + fits == firsts.size:
-                break
-            count *= 4
-        (a, b, c), (d, e, f) = low[fits - 1].tolist(), high[fits - 1].tolist()
-        begin += fits
-        until = min(int(firsts[begin]), end) if begin < firsts.size else end
-        if start < until:
-            yield Standstill(start, until, Box3((a, b, c), (d, e, f)))
-            start = until
+    box, *others = boxes
+    for first, other in zip(firsts[1:].tolist(), others, strict=True):
+        whole = box.united(other)
+        if whole.diagonal <= DRIFTED_M:
+            box = whole
+            continue
+        if start < min(first, end):
+            yield Standstill(start, min(first, end), box)
+            start = min(first, end)
+        box = other
+    if start < end:
+        yield Standstill(start, end, box)
 
 
 def _creeping(blocks: Blocks, chain: Ints, is_still: Flags) -> Flags:
