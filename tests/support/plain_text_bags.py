@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
@@ -73,14 +73,16 @@ class PlainReader(McapReader):
                 topic, type_name, time = line.split()
                 heard = times.setdefault((topic, type_name), [])
                 heard.extend([] if time == "-" else [int(time)])
-        return BagSummary(
+        return BagSummary.packed(
             tuple(
                 TopicSummary(topic, kind, "cdr", len(at), min(at), max(at), topic == "/tf_static")
                 for (topic, kind), at in times.items()
                 if at
             ),
-            silent=tuple(topic for (topic, _), at in times.items() if not at),
-            complete=text.endswith("END"),
+            SummarySchema(
+                silent=tuple(topic for (topic, _), at in times.items() if not at),
+                complete=text.endswith("END"),
+            ),
         )
 
 

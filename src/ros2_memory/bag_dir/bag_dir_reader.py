@@ -97,17 +97,15 @@ class BagDirReader(BagReader):
         summary = self.reader.summarize(self._confined(path))
         handover, problem = self._sidecar_of(path)
         if problem is not None:
-            summary = summary.replaced(notes=(*summary.notes, problem))
+            summary = summary.with_notes((*summary.notes, problem))
         rule = handover.rule(path.name)
         if rule is None:
             return summary
         if rule.hides_all:
-            return summary.replaced(topics=())
+            return summary.with_topics(())
         topics = (self._counted_summary(path, topic, rule) for topic in summary.topics)
-        return summary.replaced(
-            topics=tuple(topic for topic in topics if topic is not None),
-            notes=(*summary.notes, *handover.notes),
-        )
+        counted = summary.with_topics([topic for topic in topics if topic is not None])
+        return counted.with_notes((*summary.notes, *handover.notes))
 
     def records(
         self,

@@ -238,7 +238,7 @@ class ColumnStore(Database):
                 bags: list[BagFile] = []
                 codes: list[int] = []
                 for path, size, mtime, schema, counts, first, last, sidecar, code in chunk:
-                    summary = BagSummary.decoded(schemas[schema], counts)
+                    summary = BagSummary(schemas[schema], counts)
                     span = (first, last, sidecar)
                     bags.append(BagFile(root + path, size, mtime, BagState.CLOSED, summary, *span))
                     codes.append(code)

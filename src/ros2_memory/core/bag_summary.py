@@ -12,8 +12,7 @@ import struct
 import sys
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -73,9 +72,20 @@ class TopicHeader(NamedTuple):
 
 @dataclass(frozen=True)
 class SummarySchema:
-    """A summary without its numbers; `BagSummary` describes the fields."""
+    """A summary without its numbers.
 
-    topics: tuple[TopicHeader, ...]
+    Attributes:
+        topics: one for each topic and type.
+        silent: the topics that are declared without a message.
+        complete: False if the file ends early and only its readable part is counted.
+        notes: sentences on what is wrong with the file.
+        set_back: the greatest step back of log times of a topic, in the order of writing, if it is
+            a second or more.
+        pauses: times without a message of any topic, if some topic usually has messages.
+        absences: long times without a message of one topic, each with the messages before it.
+    """
+
+    topics: tuple[TopicHeader, ...] = ()
     silent: tuple[str, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
@@ -108,11 +118,6 @@ class SummarySchema:
         for position, header in enumerate(self.topics):
             positions[header.topic] = (*positions.get(header.topic, ()), position)
         return positions
-
-    @cached_property
-    def numbers(self) -> struct.Struct:
-        """The layout of a bag's numbers in bytes."""
-        return struct.Struct(f"<{3 * len(self.topics)}q")
 
     def to_json(self) -> str:
         """Returns the schema as JSON; equal schemas give equal texts."""
@@ -166,7 +171,7 @@ def numbers_of(
         Count, first and last log time, in the shape (positions, summaries, 3).
     """
     size = len(joined) // summaries
-    if size == schema.numbers.size:
+    if size == len(schema.topics) * _NUMBERS.size:
         numbers = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
         return numbers[:, positions].swapaxes(0, 1)
     base = np.ndarray((summaries,), "<i8", joined, 0, (size,))
@@ -196,60 +201,33 @@ def shared_schema(schema: SummarySchema) -> SummarySchema:
     return replace(schema, topics=topics, silent=tuple(map(intern, schema.silent)))
 
 
+@dataclass(frozen=True, slots=True)
 class BagSummary:
-    """What one bag file holds. Immutable; summaries of equal content are equal.
-
-    Args:
-        topics: one for each topic and type; their numbers fit into 64 bits.
-        silent: the topics that are declared without a message.
-        complete: False if the file ends early and only its readable part is counted.
-        notes: sentences on what is wrong with the file.
-        set_back: the greatest step back of log times of a topic, in the order of writing, if it is
-            a second or more.
-        pauses: times without a message of any topic, if some topic usually has messages.
-        absences: long times without a message of one topic, each with the messages before it.
+    """What one bag file holds. Summaries of equal content are equal.
 
     Attributes:
         schema: the summary without its numbers.
         data: the numbers, packed into about half of their bytes if they fit.
     """
 
-    __slots__ = ("data", "schema")
-
     schema: SummarySchema
     data: bytes
 
-    def __init__(
-        self,
-        topics: Sequence[TopicSummary],
-        silent: tuple[str, ...] = (),
-        complete: bool = True,
-        notes: tuple[str, ...] = (),
-        *,
-        set_back: SetBack = None,
-        pauses: Pauses = (),
-        absences: Absences = (),
-    ) -> None:
+    @classmethod
+    def packed(cls, topics: Sequence[TopicSummary], besides: SummarySchema) -> BagSummary:
+        """Returns a summary of topics, one for each topic and type, with numbers of 64 bits.
+
+        `besides` has all else; its own topics do not count.
+        """
         headers = (
             TopicHeader(topic.topic, topic.type, topic.encoding, topic.latched) for topic in topics
         )
-        self.schema = shared_schema(
-            SummarySchema(tuple(headers), silent, complete, notes, set_back, pauses, absences)
-        )
-        self.data = _packed(self.schema, topics)
-
-    @classmethod
-    def decoded(cls, schema: SummarySchema, data: bytes) -> Self:
-        """Returns the summary with this schema and these data."""
-        summary = cls.__new__(cls)
-        summary.schema = schema
-        summary.data = data
-        return summary
+        return cls(shared_schema(replace(besides, topics=tuple(headers))), _packed(topics))
 
     def _numbers_at(self, position: int) -> tuple[int, Ns, Ns]:
         """Returns count, first and last of the topic at a position, without unpacking others."""
         packed = self.data
-        if len(packed) == self.schema.numbers.size:
+        if len(packed) == len(self.schema.topics) * _NUMBERS.size:
             count, first, last = _NUMBERS.unpack_from(packed, position * _NUMBERS.size)
             return count, first, last
         at = _BASE.size + position * _TOPIC_BYTES
@@ -260,23 +238,15 @@ class BagSummary:
         last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
         return count, first, last
 
-    def replaced(
-        self,
-        *,
-        topics: Sequence[TopicSummary] | None = None,
-        complete: bool | None = None,
-        notes: tuple[str, ...] | None = None,
-    ) -> BagSummary:
-        """Returns this summary with some fields replaced."""
-        return BagSummary(
-            self.topics if topics is None else topics,
-            self.silent,
-            self.complete if complete is None else complete,
-            self.notes if notes is None else notes,
-            set_back=self.schema.set_back,
-            pauses=self.schema.pauses,
-            # Absences of other messages are unknown.
-            absences=self.schema.absences if topics is None else (),
+    def with_topics(self, topics: Sequence[TopicSummary]) -> BagSummary:
+        """Returns the summary with other topics; absences of their messages are unknown."""
+        return BagSummary.packed(topics, replace(self.schema, absences=()))
+
+    def with_notes(self, notes: tuple[str, ...], *, is_whole: bool = True) -> BagSummary:
+        """Returns the summary with other notes; not complete unless the file is whole, too."""
+        complete = self.complete and is_whole
+        return replace(
+            self, schema=shared_schema(replace(self.schema, notes=notes, complete=complete))
         )
 
     @property
@@ -300,11 +270,6 @@ class BagSummary:
             self._numbers_at(position) for topic in topics for position in positions.get(topic, ())
         ]
         return min(first for _, first, _ in numbers), max(last for _, _, last in numbers)
-
-    @property
-    def silent(self) -> tuple[str, ...]:
-        """The topics that are declared without a message."""
-        return self.schema.silent
 
     @property
     def complete(self) -> bool:
@@ -344,19 +309,8 @@ class BagSummary:
     def _numbers(self) -> Iterable[tuple[int, Ns, Ns]]:
         return map(self._numbers_at, range(len(self.schema.topics)))
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BagSummary):
-            return NotImplemented
-        return self.data == other.data and self.schema == other.schema
 
-    def __hash__(self) -> int:
-        return hash((self.schema, self.data))
-
-    def __repr__(self) -> str:
-        return f"BagSummary(topics={self.topics!r}, schema={self.schema!r})"
-
-
-def _packed(schema: SummarySchema, topics: Sequence[TopicSummary]) -> bytes:
+def _packed(topics: Sequence[TopicSummary]) -> bytes:
     """Packs count, first and last of each topic: relative to the bag's start if that fits.
 
     Relative numbers take 13 bytes a topic, others 24.
@@ -371,6 +325,6 @@ def _packed(schema: SummarySchema, topics: Sequence[TopicSummary]) -> bytes:
             parts.append((topic.first - base).to_bytes(_TIME_BYTES, "little"))
             parts.append((topic.last - base).to_bytes(_TIME_BYTES, "little"))
     except OverflowError:
-        numbers = ((topic.count, topic.first, topic.last) for topic in topics)
-        return schema.numbers.pack(*chain.from_iterable(numbers))
+        numbers = [(topic.count, topic.first, topic.last) for topic in topics]
+        return np.array(numbers, "<i8").tobytes()
     return b"".join(parts)

@@ -172,7 +172,7 @@ class BagRows:
             strict=True,
         ):
             schema, data, length = kinds[kind]
-            summary = BagSummary.decoded(schema, data[place * length : (place + 1) * length])
+            summary = BagSummary(schema, data[place * length : (place + 1) * length])
             yield BagFile(file, size, mtime, _STATES[state], summary, start, end, sidecar)
 
 

@@ -319,7 +319,7 @@ def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) 
         return Classification(FileState.ACTIVE, aside=replace(aside, answers=True))
     if not summary.complete:
         # The first note says that the file ends early: this one is still growing.
-        summary = summary.replaced(notes=summary.notes[1:])
+        summary = summary.with_notes(summary.notes[1:])
     bag = _bag_file(notes, BagState.ACTIVE, summary)
     answering = replace(aside, reason=_ANSWERS, answers=True, until=bag.end)
     return Classification(FileState.ACTIVE, bag, answering)
@@ -345,7 +345,7 @@ def _classify_readable(notes: FileNotes, summary: BagSummary) -> Classification:
     is_closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
         if is_closed and not summary.notes:
-            return Classification(FileState.EMPTY, silent=summary.silent)
+            return Classification(FileState.EMPTY, silent=summary.schema.silent)
         if is_closed:
             return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
         closes = _RECOVER if notes.kind == ".mcap" else ""

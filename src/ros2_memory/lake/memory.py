@@ -242,7 +242,7 @@ class LakeIndex:
                 path = f"{path}-{shipped.bag_id}"
             if schema not in schemas:
                 schemas[schema] = SummarySchema.from_json(schema)
-            file = _bag_file(path, shipped, BagSummary.decoded(schemas[schema], counts))
+            file = _bag_file(path, shipped, BagSummary(schemas[schema], counts))
             before = known.get(path)
             if before is not None and before.file == file:
                 file = before.file  # derived data is remembered by this object

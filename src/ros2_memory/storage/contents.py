@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.core.arrays import run_starts
-from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, SummarySchema, TopicSummary
 from ros2_memory.core.pauses import (
     SHORTEST_PAUSE_NS,
     SHORTEST_SILENCE_NS,
@@ -85,8 +85,8 @@ class Contents(NamedTuple):
         silent = declared - {topic.topic for topic in topics}
         start = min((topic.first for topic in topics), default=0)
         end = max((topic.last for topic in topics), default=0)
-        return BagSummary(
-            topics,
+        besides = SummarySchema(
+            (),
             tuple(sorted(silent)),
             complete,
             notes,
@@ -94,6 +94,7 @@ class Contents(NamedTuple):
             pauses=noteworthy(self.pauses, [topic.count for topic in topics], end - start),
             absences=tuple((topic, pauses) for topic, pauses in absences.items() if pauses),
         )
+        return BagSummary.packed(topics, besides)
 
 
 class _Spans(NamedTuple):

@@ -254,7 +254,7 @@ class FileReader(BagReader):
         """Returns topics with exact counts and exact first and last log times."""
         with reading(path), self._open(path) as (bags, file, note):
             summary = bags.summarize(file)
-        return summary.replaced(complete=False, notes=(note, *summary.notes)) if note else summary
+        return summary.with_notes((note, *summary.notes), is_whole=False) if note else summary
 
     def records(
         self,

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.pauses import noteworthy, pauses_among
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -27,12 +27,12 @@ ODOM = "nav_msgs/msg/Odometry"
 
 def _bag(name: str, *topics: tuple[str, int, int], type_name: str = ODOM) -> BagFile:
     """A bag whose topics are given as (name, first, last)."""
-    summary = BagSummary(
+    summary = BagSummary.packed(
         [
             TopicSummary(topic, type_name, "cdr", 2, first, last, latched=topic == "/tf_static")
             for topic, first, last in topics
         ],
-        silent=("/idle",),
+        SummarySchema(silent=("/idle",)),
     )
     return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
 
@@ -40,7 +40,7 @@ def _bag(name: str, *topics: tuple[str, int, int], type_name: str = ODOM) -> Bag
 def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> None:
     bag = _bag("rec/rec_0.mcap", ("/odom", 0, 800 * S), ("/seen", 0, 800 * S))
     absences = (("/seen", ((100 * S, 400 * S, 100),)),)
-    summary = BagSummary(bag.summary.topics, absences=absences)
+    summary = BagSummary.packed(bag.summary.topics, SummarySchema(absences=absences))
     snapshot = Snapshot(Timeline.of([bag._replace(summary=summary)]))
     assert [snapshot.longest_silence(topic) for topic in ("/odom", "/seen")] == [0, 300 * S]
 
@@ -160,7 +160,7 @@ def split_up(topics: Sequence[Times], split: float, length: float) -> list[BagFi
             TopicSummary(f"/{nth}", "T", "cdr", times.size, int(times[0]), int(times[-1]))
             for nth, times in held.items()
         ]
-        summary = BagSummary(rows, pauses=found)
+        summary = BagSummary.packed(rows, SummarySchema(pauses=found))
         file = f"/bags/rec/rec_{number}.mcap"
         bags.append(BagFile(file, 1, 1, BagState.CLOSED, summary, first, last))
     return bags

@@ -130,7 +130,7 @@ def test_what_channels_declare_and_publish_times_are_kept(shelf: Shelf, tmp_path
     ]
     reader, path = shelf.stocked(tmp_path, messages, declared=silent)
     summary, channels = reader.summarize(path), reader.channels(path)
-    assert summary.silent == ("/quiet", "/still")
+    assert summary.schema.silent == ("/quiet", "/still")
     assert {t.topic: t.latched for t in summary.topics} == {"/tf_static": True, "/odom": False}
     recorded = {(m.topic, m.type) for m in messages}
     assert {(c.topic, c.type) for c in channels} == {*recorded, *silent}
