@@ -51,7 +51,7 @@ def main() -> None:
                 lake.tables[TABLE].append(TABLES[TABLE].to_arrow(rows_of(day)))
             until = WallClock().now() + NS_PER_S
             expire(lake, until)
-            table = lake.current(TABLE)
+            table = lake.tables[TABLE].refresh()
             print(f"read: {spent_us(lambda: Partitions().read(table)):.0f} us a file")
             print(f"look for old ones: {spent_us(lambda: expire(lake, until)):.0f} us a file")
             tracemalloc.start()

@@ -108,7 +108,7 @@ def _make(folder: Path, rows: Sequence[Tables], robots: int, seed: int) -> int:
             made = [_robot(rows[nth % len(rows)], f"r{nth:03}", chance) for nth in some]
             for name, table in TABLES.items():
                 whole = pa.concat_tables([each[name] for each in made])
-                lake.current(name).append(table.sort(whole))
+                lake.tables[name].refresh().append(table.sort(whole))
             bags += sum(each["bags"].num_rows for each in made)
     return bags
 

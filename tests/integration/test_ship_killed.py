@@ -105,7 +105,7 @@ def check(folder: Path, bags: int) -> None:
         used = {
             task.file.file_path.removeprefix("file://")
             for name in TABLES
-            for task in lake.current(name).scan().plan_files()
+            for task in lake.tables[name].refresh().scan().plan_files()
         }
     for name in ROBOTS:
         here = {

@@ -17,7 +17,6 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import pyarrow as pa
-from pyarrow import fs
 from pyarrow.dataset import ParquetFragmentScanOptions
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
@@ -195,14 +194,12 @@ class Lake:
     def _files_of(self, name: str, files: Iterable[LakeFile]) -> TableFiles:
         """Returns files of a table, with their store."""
         locations = [PyArrowFileIO.parse_location(file.location) for file in files]
-        paths, schema = [path for _, _, path in locations], TABLES[name].arrow_schema
         scheme, host, _ = next(iter(locations), ("file", "", ""))
-        if scheme == "file":
-            return TableFiles(schema, paths, fs.LocalFileSystem())
         with self._looking():
             table = self._loaded_table(name)
             properties = {} if table is None else {**table.io.properties}
-            return TableFiles(schema, paths, PyArrowFileIO(properties).fs_by_scheme(scheme, host))
+            store = PyArrowFileIO(properties).fs_by_scheme(scheme, host)
+        return TableFiles(TABLES[name].arrow_schema, [path for _, _, path in locations], store)
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -112,7 +112,7 @@ def expire(lake: LakeTables, until: Ns) -> int:
     gone: set[str] = set()
     state_dir = lake.location.state_dir
     with lake.location.translated("deleting old files of the lake"):
-        tables = [lake.current(name) for name in TABLES]
+        tables = [lake.tables[name].refresh() for name in TABLES]
         for table in tables:
             _drop_versions(table, until)
         recorded = WRITTEN.rows(state_dir)
@@ -267,7 +267,7 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     files = expire(lake, MAX_NS)
     kept_by: list[str] = []
     for name in TABLES:
-        metadata = lake.current(name).metadata
+        metadata = lake.tables[name].metadata
         for ref, version in metadata.refs.items():
             if version.snapshot_id != metadata.current_snapshot_id:
                 kept_by.append(f"{name}: {ref}")

@@ -25,7 +25,6 @@ import uuid
 import warnings
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import date, timedelta
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
@@ -38,6 +37,7 @@ from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 from pyiceberg.manifest import ManifestContent, ManifestFile
 from pyiceberg.table import Transaction
 from pyiceberg.transforms import IdentityTransform
+from pyiceberg.utils.datetime import days_to_date
 from sqlalchemy import URL
 
 from ros2_memory.bag_dir.durable_write import write_durably
@@ -49,6 +49,7 @@ from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
+    from datetime import date
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
@@ -70,7 +71,6 @@ _MOST_CHARS: Final = 500
 _ATTEMPTS: Final = 5
 """Attempts at a commit that conflicts with another one; pyiceberg repeats only some itself."""
 _MASK: Final = "********"
-_EPOCH: Final = date(1970, 1, 1)
 _LAST: Final = "\U0010ffff"
 """A text after all ids of bags."""
 
@@ -258,27 +258,26 @@ class LakeTables:
         """The id of the lake: another one where its tables were created again."""
         return str(self.tables["bags"].metadata.table_uuid)
 
-    def current(self, name: str) -> IcebergTable:
-        """Returns the newest version of a table.
+    @contextmanager
+    def _newest(self, name: str, doing: str) -> Iterator[IcebergTable]:
+        """Yields the newest version of a table, for what the block is doing with it.
 
         Raises:
-            LakeError: the lake cannot be read; all other methods raise it, too.
+            LakeError: the lake cannot be read or written; all other methods raise it, too.
         """
-        with self.location.translated(f"reading the lake's {name}"):
-            return self.tables[name].refresh()
+        with self.location.translated(f"{doing} the lake's {name}"):
+            yield self.tables[name].refresh()
 
     def days(self, name: str) -> Mapping[str, Days]:
         """Returns the files of a table by robot; see `Partitions`."""
-        table = self.current(name)
-        with self.location.translated(f"looking into the lake's {name}"):
+        with self._newest(name, "looking into") as table:
             return Partitions().read(table)
 
     def rows(
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
     ) -> pa.Table:
         """Returns the rows that meet a condition."""
-        table = self.current(name)
-        with self.location.translated(f"reading the lake's {name}"):
+        with self._newest(name, "reading") as table:
             return table.scan(condition, selected_fields=columns).to_arrow()
 
     def replace(
@@ -315,8 +314,7 @@ class LakeTables:
 
     def _commit(self, name: str, doing: str, write: Callable[[IcebergTable], object]) -> None:
         for attempt in range(_ATTEMPTS):
-            table = self.current(name)
-            with self.location.translated(f"{doing} the lake's {name}"):
+            with self._newest(name, doing) as table:
                 try:
                     write(table)
                 except (CommitFailedException, ValidationException):
@@ -406,28 +404,27 @@ def _id_in(state_dir: Path) -> str:
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file by its URI, with the number of its rows and its size in bytes.
+    """A Parquet file with rows of one robot and day, as lists of files are sorted.
 
-    The ids of the bags in it are from `first` to `last`.
+    Attributes:
+        location: its URI.
+        rows: the number of its rows.
+        size: in bytes.
+        first: the least id of its bags, or a text before it.
+        last: the greatest id of its bags, or a text after it.
     """
 
+    robot: str
+    day: date
     location: str
-    rows: int = 0
-    size: int = 0
-    first: str = ""
-    last: str = _LAST
+    rows: int
+    size: int
+    first: str
+    last: str
 
 
 Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
 """The files of one robot in one table by day, in order of the days."""
-
-
-class _PartitionFile(NamedTuple):
-    """A file, and the robot and day whose rows it has."""
-
-    robot: str
-    day: date
-    file: LakeFile
 
 
 class Partitions:
@@ -435,7 +432,7 @@ class Partitions:
 
     def __init__(self) -> None:
         self._snapshot: int | None = None
-        self._by_manifest: dict[str, Sequence[_PartitionFile]] = {}
+        self._by_manifest: dict[str, Sequence[LakeFile]] = {}
         self._robots: dict[str, dict[date, list[LakeFile]]] = {}
 
     def read(self, table: IcebergTable) -> Mapping[str, Days]:
@@ -448,19 +445,19 @@ class Partitions:
         snapshot_id = None if snapshot is None else snapshot.snapshot_id
         if snapshot_id == self._snapshot:
             return self._robots
-        by_manifest: dict[str, Sequence[_PartitionFile]] = {}
+        by_manifest: dict[str, Sequence[LakeFile]] = {}
         for manifest in [] if snapshot is None else snapshot.manifests(table.io):
             path = manifest.manifest_path
             by_manifest[path] = self._by_manifest.get(path) or [*_files_in(manifest, table)]
         robots: dict[str, dict[date, list[LakeFile]]] = {}
-        for robot, day, file in sorted(chain.from_iterable(by_manifest.values())):
-            robots.setdefault(robot, {}).setdefault(day, []).append(file)
+        for file in sorted(chain.from_iterable(by_manifest.values())):
+            robots.setdefault(file.robot, {}).setdefault(file.day, []).append(file)
         self._by_manifest, self._robots = by_manifest, robots
         self._snapshot = snapshot_id
         return robots
 
 
-def _files_in(manifest: ManifestFile, table: IcebergTable) -> Iterator[_PartitionFile]:
+def _files_in(manifest: ManifestFile, table: IcebergTable) -> Iterator[LakeFile]:
     """Yields the data files that a manifest of a table lists.
 
     Raises:
@@ -472,27 +469,26 @@ def _files_in(manifest: ManifestFile, table: IcebergTable) -> Iterator[_Partitio
         do = "rewrite them into its data files first (copy-on-write)"
         raise RefusedError(f"{name} has delete files, which another program wrote: {do}")
     spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
-    positions = {
-        schema.find_column_name(part.source_id): position
-        for position, part in enumerate(spec.fields)
-        if isinstance(part.transform, IdentityTransform)
-    }
-    for column in ("robot", "day"):
-        if column not in positions:
-            why = f"has files that are not of one {column}, which another program wrote"
-            raise RefusedError(f"{name} {why}: partition it by robot and day again")
+    parts = [
+        schema.find_column_name(part.source_id) if part.transform == IdentityTransform() else None
+        for part in spec.fields
+    ]
+    if not {"robot", "day"}.issubset(parts):
+        why = "has files that are not of one robot and day, which another program wrote"
+        raise RefusedError(f"{name} {why}: partition it by robot and day again")
+    robot, day = parts.index("robot"), parts.index("day")
     bag_id = schema.find_field("bag_id").field_id
     for entry in entries:
         data = entry.data_file
-        file = LakeFile(
+        yield LakeFile(
+            str(data.partition[robot]),
+            days_to_date(data.partition[day]),
             data.file_path,
             data.record_count,
             data.file_size_in_bytes,
-            first=_bound_of(bag_id, data.lower_bounds),
-            last=_bound_of(bag_id, data.upper_bounds) or _LAST,
+            _bound_of(bag_id, data.lower_bounds),
+            _bound_of(bag_id, data.upper_bounds) or _LAST,
         )
-        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
-        yield _PartitionFile(str(data.partition[positions["robot"]]), day, file)
 
 
 def _bound_of(field_id: int, bounds: Mapping[int, bytes] | None) -> str:

@@ -271,7 +271,7 @@ def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
     secret_bag(bag_dir)
     ship_from(tmp_path)
     with location(lake).writable() as tables:
-        table = tables.current("messages")
+        table = tables.tables["messages"].refresh()
         snapshot = table.current_snapshot()
         assert snapshot is not None
         table.manage_snapshots().create_tag(snapshot.snapshot_id, "audit").commit()
@@ -313,7 +313,7 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
     values = lake_column(lake, "messages", "texts")
     with location(lake).writable() as tables:
-        messages = tables.current("messages")
+        messages = tables.tables["messages"].refresh()
         versions = len(messages.snapshots())
         assert compact(tables, (START_S + 3600) * NS_PER_S) == 0
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) > 0

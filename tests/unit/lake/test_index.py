@@ -218,7 +218,7 @@ def days_of(sizes: Sequence[tuple[int, int]]) -> Days:
     found, day = {}, FIRST
     for gap, size in sizes:
         day += timedelta(days=gap + 1)
-        found[day] = (LakeFile(f"file:///{day}", size),)
+        found[day] = (LakeFile("hall", day, f"file:///{day}", size, 0, "", ""),)
     return found
 
 
