@@ -25,7 +25,7 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
     from datetime import time
 
     from pydantic_core.core_schema import NullableSchema
@@ -318,43 +318,6 @@ class Tool:
         return self.describe()
 
 
-def _ask_at_one_time(question: Question, memory: Memory, call: Call) -> Answer:
-    """Answers a question by one reading of the clock."""
-    return question(replace(memory, clock=StoppedClock(memory.clock.now())), call)
-
-
-def _ask_at_each(
-    query: Query,
-    arguments: Mapping[str, object],
-    moments: Sequence[AtTime],
-    memory: Memory,
-    call: Call,
-) -> Answer:
-    """Answers a query about several moments, one after the other."""
-
-    def ask(fixed: Memory, moment: AtTime) -> MomentAnswer:
-        return cast("MomentAnswer", query(fixed, call, **{**arguments, "moment": moment}))
-
-    return at_each(memory, moments, ask)
-
-
-def _ask_in_each(
-    query: Query,
-    arguments: Mapping[str, object],
-    between: tuple[time, time],
-    memory: Memory,
-    call: Call,
-) -> Answer:
-    """Answers a query about the same local hours of each day."""
-
-    def ask(fixed: Memory, span: TimeRange) -> OneAnswer:
-        bounds = {"span": span, "start_s": span.start_s, "end_s": span.end_s, "last_s": None}
-        own = {name: value for name, value in bounds.items() if name in arguments}
-        return cast("OneAnswer", query(fixed, call, **{**arguments, **own}))
-
-    return in_each(memory, call, _span_of(arguments), between, ask)
-
-
 def _span_of(arguments: Mapping[str, object]) -> TimeRange:
     """Returns the window of a call: its span, or its bounds where these are arguments."""
     span = arguments.get("span")
@@ -363,6 +326,12 @@ def _span_of(arguments: Mapping[str, object]) -> TimeRange:
     names = ("start_s", "end_s", "last_s")
     start, end, last = (cast("float | None", arguments.get(name)) for name in names)
     return TimeRange(start, end, last)
+
+
+def _with_span(arguments: Mapping[str, object], span: TimeRange) -> dict[str, object]:
+    """Returns the arguments of a call with another window, however they state one."""
+    bounds = {"span": span, "start_s": span.start_s, "end_s": span.end_s, "last_s": None}
+    return {**arguments, **{name: bounds[name] for name in bounds if name in arguments}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -446,7 +415,7 @@ class ToolDeclaration:
         return text, schema
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
-        """Checks the arguments of a call, and returns its question.
+        """Checks the arguments of a call, and returns its question, which reads the clock once.
 
         Raises:
             InvalidArgumentsError: they are refused.
@@ -455,13 +424,23 @@ class ToolDeclaration:
         between = cast("tuple[time, time] | None", arguments.pop("between", None))
         query, chosen = self._choose_query(arguments)
         moment = chosen.get("moment")
-        if isinstance(moment, AtTime) and moment.each:
-            question: Question = partial(_ask_at_each, query, chosen, moment.each)
-        elif between is not None:
-            question = partial(_ask_in_each, query, chosen, between)
-        else:
-            question = partial(query, **chosen)
-        return partial(_ask_at_one_time, question)
+
+        def ask(memory: Memory, call: Call) -> Answer:
+            memory = replace(memory, clock=StoppedClock(memory.clock.now()))
+
+            def ask_at(fixed: Memory, moment: AtTime) -> MomentAnswer:
+                return cast("MomentAnswer", query(fixed, call, **{**chosen, "moment": moment}))
+
+            def ask_in(fixed: Memory, span: TimeRange) -> OneAnswer:
+                return cast("OneAnswer", query(fixed, call, **_with_span(chosen, span)))
+
+            if isinstance(moment, AtTime) and moment.each:
+                return at_each(memory, moment.each, ask_at)
+            if between is not None:
+                return in_each(memory, call, _span_of(chosen), between, ask_in)
+            return query(memory, call, **chosen)
+
+        return ask
 
     def _choose_query(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
         """Returns the query that answers, and its arguments.
