@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory import results
 from ros2_memory.analysis.clock_steps import across_steps, while_recorded
@@ -122,7 +122,7 @@ from ros2_memory.places.pose_frames import (
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -133,8 +133,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
-
-A = TypeVar("A", results.Match, results.ValueWhen)
 
 _NOT_A_NUMBER: Final = "the recorded position is not a number"
 
@@ -153,6 +151,81 @@ _ENDED_GOALS: Final = (
 )
 
 
+class _Asked(NamedTuple):
+    """A moment that is asked about, and how old a message may be then.
+
+    Attributes:
+        view: shows the moment.
+        at: the moment.
+        now: what ages count from; None if the moment was not relative to it.
+        window: of the messages that count.
+        tolerance: how old they may be; None for any age.
+        is_strict: whether the tolerance was given, so that no message may be older.
+    """
+
+    view: View
+    at: Ns
+    now: Ns | None
+    window: TimeWindow
+    tolerance: Ns | None
+    is_strict: bool
+
+    @classmethod
+    def of(cls, memory: Memory, call: Call, moment: AtTime, tolerance_s: float | None) -> _Asked:
+        """Opens the view of a moment, with a tolerance (s) or that of the settings."""
+        view, at, now = open_moment(memory, call, moment)
+        limit = view.limits.time_tolerance_s if tolerance_s is None else tolerance_s
+        tolerance: Ns | None = ns_argument("tolerance_s", limit)
+        start = at - (tolerance or 0) - START_SLACK_NS
+        if start <= MIN_NS:
+            start, tolerance = MIN_NS, None
+        stop = at + ns_from_unix(moment.rest_s) + AT_OR_BEFORE_SLACK_NS + 1
+        window = TimeWindow(start, min(stop, MAX_NS))
+        return cls(view, at, now, window, tolerance, tolerance_s is not None)
+
+    def age(self, stored: StoredMessage) -> Ns | None:
+        """Returns the age of a message, if the moment was relative to now."""
+        return None if self.now is None else self.now - stored.time
+
+    def newest(self, topic: str, *, is_pose: bool = False) -> StoredMessage:
+        """Returns the newest message of a topic in the window.
+
+        Unless it is strict, a latched message may have any age, and a pose of a thinned day holds
+        until the next.
+
+        Raises:
+            NoDataError: there is no such message.
+        """
+        view, stop, tolerance = self.view, self.window.stop, self.tolerance
+        stored = view.stream.newest(topic, self.window)
+        if stored is None and not self.is_strict and is_pose:
+            stored = _thinned_pose(view, topic, stop)
+        deleted = False
+        latching = view.limits.latching
+        if stored is None and not self.is_strict and latching.may_latch(view.snapshot, topic):
+            newest = view.stream.last(topic, stop)
+            if newest is None:
+                tolerance = None  # there is none of any age
+            elif latching.holds(view.snapshot, newest):
+                deleted = not still_holds(view, newest, self.at)
+                if deleted:
+                    note_unread(view, TimeWindow(newest.time, stop), nothing=True)
+                else:
+                    stored = newest
+        if stored is None:
+            raise no_data_at(view, (topic,), self.at, tolerance, deleted=deleted)
+        note_robots_near(view, stored)
+        note_unread(view, TimeWindow(stored.time, stop))
+        return stored
+
+    def note_latched(self, stored: StoredMessage) -> None:
+        """Notes the age of a latched message, for replies that do not show it."""
+        if still_holds(self.view, stored, self.at):
+            age = seconds(max(self.at - stored.time, 0))
+            still = f"its value of {age} before is still valid"
+            self.view.notes.add(f"{stored.topic} is latched: {still}")
+
+
 def topic_value(
     memory: Memory,
     call: Call,
@@ -166,24 +239,16 @@ def topic_value(
 
     A latched topic has no tolerance unless one is given: its newest message holds.
     """
-    view, at, now = open_moment(memory, call, moment)
-    stored = _newest_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
-    window, _ = _window_before(view, at, tolerance_s, moment.rest_s)
-    stating = newest_stating(view, stored, fields, window.start)
-    if stating is None:
-        view.notes.add(*_last_named(view, stored, fields))
+    asked = _Asked.of(memory, call, moment, tolerance_s)
+    view = asked.view
+    stored = asked.newest(resolve_topic(view, topic))
+    stating = newest_stating(view, stored, fields, asked.window.start)
+    if stating is None and (earlier := newest_stating(view, stored, fields, MIN_NS)):
+        last = f"{listed(fields)}: last at {unix_text(earlier.time)}"
+        view.notes.add(f"{last}; a longer tolerance_s reaches it")
     stored = stating or stored
-    value = _as_value(view, stored, fields, now)
-    return _with_latched_age(view, value, stored, at)
-
-
-def _last_named(view: View, stored: StoredMessage, fields: Sequence[str]) -> tuple[str, ...]:
-    """Returns a note on when a message before `stored`, which names other joints, named these."""
-    stating = newest_stating(view, stored, fields, MIN_NS)
-    if stating is None:
-        return ()
-    asked = listed(fields)
-    return (f"{asked}: last at {unix_text(stating.time)}; a longer tolerance_s reaches it",)
+    value = _as_value(view, stored, fields, asked.now)
+    return _with_latched_age(view, value, stored, asked.at)
 
 
 def topic_range(
@@ -202,63 +267,100 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    stating = _Stating(view, fields, window.start)
-    shown, failures = _show_messages(view, stating.of(picked), fields)
-    chosen = len(shown) + failures.total()
-    if stating.left_out and not chosen:
+    read = _read_samples(view, picked, fields, window.start)
+    samples, decoded = read.samples, len(read.samples) + read.undecodable.total()
+    if read.unnamed and not decoded:
         note_unnamed(view, name, [dict.fromkeys(fields)], window.stop)
         detail = f"the messages of {name} in this time say nothing of {listed(fields)}"
         raise with_notes(view, window, NoDataError(NoDataReason.BETWEEN_MESSAGES, detail))
-    chosen += stating.left_out
-    if not chosen:
+    if not decoded:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    if not shown:
-        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+    if not samples:
+        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(read.undecodable)))
         raise with_notes(view, window, undecodable)
-    for sample in shown:
-        view.notes.add(*sample.notes)
-    view.notes.add(*(f"{count} samples left out: {why}" for why, count in failures.items()))
-    types = [*dict.fromkeys(sample.type_name for sample in shown)]
-    if len(types) > 1:
-        view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
+    view.notes.add(*read.notes)
+    for why, count in read.undecodable.items():
+        view.notes.add(f"{count} samples left out: {why}")
+    if len(read.types) > 1:
+        view.notes.add(f"the topic was recorded under several types: {', '.join(read.types)}")
+    chosen = decoded + read.unnamed
     if chosen < total:
         view.notes.add(f"{chosen} of {total} samples, evenly spaced over the window")
-    if stating.left_out:
-        view.notes.add(f"{stating.left_out} samples left out: they say nothing of the fields")
+    if read.unnamed:
+        view.notes.add(f"{read.unnamed} samples left out: they say nothing of the fields")
     note_unread(view, window, gaps=chosen < total)
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
     if fields:
-        note_unnamed(view, name, [sample.value for sample in shown], window.stop)
+        note_unnamed(view, name, [sample.value for sample in samples], window.stop)
     note_no_fix(view, name, window, fields)
-    samples = tuple(Sample(sample.time, sample.value) for sample in shown)
     return results.TopicRange(
-        name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
+        name,
+        [*read.types][-1],
+        total,
+        tuple(samples),
+        extremes,
+        (*fields,),
+        notes=view.notes.sentences(),
     )
 
 
-class _Stating:
-    """Messages that say something of fields, in place of those that name other joints.
+class _Samples(NamedTuple):
+    """Messages as replies show them, and how many were left out.
 
     Attributes:
-        left_out: how many messages have none between the message before and themselves.
+        samples: log times and values.
+        types: the types of these messages, each once.
+        notes: on these messages alone.
+        undecodable: how often each error kept a message from being decoded.
+        unnamed: how many messages name other joints, as all do since the message before.
     """
 
-    def __init__(self, view: View, fields: Sequence[str], start: Ns) -> None:
-        self.left_out = 0
-        self._view, self._fields, self._since = view, fields, start
+    samples: list[Sample]
+    types: dict[str, None]
+    notes: list[str]
+    undecodable: Counter[str]
+    unnamed: int
 
-    def of(self, messages: Iterable[StoredMessage]) -> Iterator[StoredMessage]:
-        """Yields for each message the newest one that says something; messages are in order."""
-        for message in messages:
-            stating = newest_stating(self._view, message, self._fields, self._since)
-            self._since = message.time + 1
-            if stating is None:
-                self.left_out += 1
-            else:
-                yield stating
+
+def _read_samples(
+    view: View, messages: Iterable[StoredMessage], fields: Sequence[str], since: Ns
+) -> _Samples:
+    """Returns messages, given in order, as replies show them.
+
+    In place of a message that names other joints stands the newest one, but not before `since` or
+    the message before, that says something of the fields. A message without one of the fields, as
+    of another type, is left out with a note.
+
+    Raises:
+        InvalidArgumentsError: no message has the fields.
+    """
+    read = _Samples([], {}, [], Counter(), 0)
+    lacking, unnamed = Counter[str](), 0
+    for message in messages:
+        stating = newest_stating(view, message, fields, since)
+        since = message.time + 1
+        if stating is None:
+            unnamed += 1
+            continue
+        try:
+            _, extracted = _decode_shown(view, stating, fields)
+        except NoDataError as error:
+            read.undecodable[error.detail] += 1
+        except InvalidArgumentsError as error:
+            lacking[str(error)] += 1
+        else:
+            read.samples.append(Sample(stating.time, extracted.value))
+            read.types[stating.type] = None
+            read.notes.extend(extracted.notes)
+        del message, stating  # frees it before the next one is read
+    for detail, count in lacking.items():
+        if not read.samples:
+            raise InvalidArgumentsError(detail)
+        view.notes.add(f"{count} samples left out: {detail}")
+    return read._replace(unnamed=unnamed)
 
 
 def position(
@@ -274,24 +376,18 @@ def position(
 
     The pose is in its own frame, or in `frame_id`. A satellite receiver's topic gives degrees.
     """
-    view, at, now = open_moment(memory, call, moment)
+    asked = _Asked.of(memory, call, moment, tolerance_s)
+    view = asked.view
     name = resolve_path_topic(view, topic, degrees=True)
     if body_of(view, name) is not None:
-        return _position_of_body(
-            view,
-            at,
-            tolerance_s=tolerance_s,
-            rest_s=moment.rest_s,
-            now=now,
-            frame_id=frame_id,
-        )
+        return _position_of_body(asked, frame_id)
     _require_kind(view, name, "position", "geodetic")
     try:
-        stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+        stored = asked.newest(name, is_pose=True)
     except NoDataError as error:
-        detail = error.detail + describe_earlier_poses(view, name, at + 1)
+        detail = error.detail + describe_earlier_poses(view, name, asked.at + 1)
         raise NoDataError(error.reason, detail, error.notes) from error
-    _note_latched(view, stored, at)
+    asked.note_latched(stored)
     message = require_decoded(view, stored)
     pose, geodetic = view.extractor.pose(message, stored.type), None
     if pose is not None:
@@ -303,7 +399,7 @@ def position(
         _note_geodetic(view, geodetic)
         pose = Pose((math.nan,) * 3, None, geodetic.frame_id)
     notes = view.notes.sentences()
-    return results.Position(name, stored.time, pose, _age(stored, now), geodetic, notes=notes)
+    return results.Position(name, stored.time, pose, asked.age(stored), geodetic, notes=notes)
 
 
 def _note_geodetic(view: View, geodetic: Geodetic) -> None:
@@ -350,27 +446,19 @@ def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
     )
 
 
-def _position_of_body(
-    view: View,
-    at: Ns,
-    *,
-    tolerance_s: float | None,
-    rest_s: float,
-    now: Ns | None,
-    frame_id: str | None,
-) -> results.Position:
+def _position_of_body(asked: _Asked, frame_id: str | None) -> results.Position:
     """Returns where transforms place the robot's body, and the latitude and longitude then.
 
     Raises:
         NoDataError: no transform places it at the moment, or within the tolerance before.
     """
-    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
-    newest = newest_of_body(view, window, frame_id)
+    view = asked.view
+    newest = newest_of_body(view, asked.window, frame_id)
     if newest is None:
-        raise _unplaced_error(view, at, tolerance, frame_id)
+        raise _unplaced_error(asked, frame_id)
     stored, pose = newest
     note_robots_near(view, stored)
-    note_unread(view, TimeWindow(stored.time, window.stop))
+    note_unread(view, TimeWindow(stored.time, asked.window.stop))
     if view.limits.places:
         pose = with_place(view, pose, stored.time, stored.bag.recording)
     geodetic, fix_topics = None, topics_of_robot(view, "geodetic")
@@ -381,22 +469,23 @@ def _position_of_body(
         if fix is not None and message is not None:
             geodetic = view.extractor.geodetic(message, fix.type)
     topic, notes = stored.topic, view.notes.sentences()
-    return results.Position(topic, stored.time, pose, _age(stored, now), geodetic, notes=notes)
+    return results.Position(topic, stored.time, pose, asked.age(stored), geodetic, notes=notes)
 
 
-def _unplaced_error(view: View, at: Ns, tolerance: Ns | None, frame_id: str | None) -> NoDataError:
+def _unplaced_error(asked: _Asked, frame_id: str | None) -> NoDataError:
     """Returns why no transform places the robot's body at a moment."""
+    view, at = asked.view, asked.at
+    near = TimeWindow.around(at, TF_CACHE_NS)
     body = body_at(view, at)
     error = None
     try:
         if body is not None:
             parent = frame_id or body.parent
             frame_history.transform_at(view, parent, body.child, at)
-            error = _too_old_error(view, body, parent, at, tolerance)
-        error = error or no_data_at(view, view.moving_topics, at, tolerance)
+            error = _too_old_error(asked, body, parent)
+        error = error or no_data_at(view, view.moving_topics, at, asked.tolerance)
     except NoDataError as no_transform:
-        error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), no_transform)
-    near = TimeWindow.around(at, TF_CACHE_NS)
+        error = with_notes(view, near, no_transform)
     fixes = [
         named
         for named in topics_with(view, "geodetic")
@@ -406,13 +495,12 @@ def _unplaced_error(view: View, at: Ns, tolerance: Ns | None, frame_id: str | No
     return NoDataError(error.reason, error.detail + advice, error.notes)
 
 
-def _too_old_error(
-    view: View, body: Body, parent: str, at: Ns, tolerance: Ns | None
-) -> NoDataError | None:
+def _too_old_error(asked: _Asked, body: Body, parent: str) -> NoDataError | None:
     """Returns that the newest transform of the body is older than the tolerance, and how old.
 
     None unless other frames have newer ones on these topics: else messages are lacking.
     """
+    view, at, tolerance = asked.view, asked.at, asked.tolerance
     newest = newest_of_body(view, TimeWindow(at - TF_CACHE_NS, at + 1), parent)
     within = TimeWindow(at if tolerance is None else at - tolerance, at + 1)
     has_others = any(view.stream.newest(topic, within) for topic in view.moving_topics)
@@ -437,16 +525,17 @@ def velocity(
     tolerance_s: float | None = None,
 ) -> results.Velocity:
     """Returns the robot's newest twist at or before a moment, within the tolerance (s)."""
-    view, at, now = open_moment(memory, call, moment)
+    asked = _Asked.of(memory, call, moment, tolerance_s)
+    view = asked.view
     name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
-    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
-    _note_latched(view, stored, at)
+    stored = asked.newest(name, is_pose=True)
+    asked.note_latched(stored)
     twist = memory.extractor.twist(require_decoded(view, stored), stored.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", stored))
     return results.Velocity(
-        name, stored.time, twist, _age(stored, now), notes=view.notes.sentences()
+        name, stored.time, twist, asked.age(stored), notes=view.notes.sentences()
     )
 
 
@@ -492,22 +581,22 @@ def find_last_match(
     with a score below `min_score` do not count.
     """
     now, until = memory.clock.now(), _search_end(before_s)
-
-    def show(view: View, match: StoredMessage) -> results.Match:
-        note_robots_near(view, match)
-        _note_unsearched(view, match, until, now)
-        # The view may show some days of long ago only.
-        newest_known = memory.index.published or view.snapshot
-        counted_from = memory.now(newest_known.latest, call)
-        is_future = match.time > counted_from + FUTURE_NS
-        if is_future:
-            after = seconds(match.time - counted_from)
-            view.notes.add(f"dated {after} after now: when it was is unknown")
-        shown = _as_value(view, match, fields, None if is_future else counted_from)
-        return results.Match(shown, notes=shown.notes)
-
     search = _Search(topic, condition_type, value, field, min_score, until)
-    return _last_match(View(memory, call, min(now, until)), search, show)
+    found = _last_match(View(memory, call, min(now, until)), search)
+    if isinstance(found, results.Match):
+        return found
+    view, match = found
+    note_robots_near(view, match)
+    _note_unsearched(view, match, until, now)
+    # The view may show some days of long ago only.
+    newest_known = memory.index.published or view.snapshot
+    counted_from = memory.now(newest_known.latest, call)
+    is_future = match.time > counted_from + FUTURE_NS
+    if is_future:
+        after = seconds(match.time - counted_from)
+        view.notes.add(f"dated {after} after now: when it was is unknown")
+    shown = _as_value(view, match, fields, None if is_future else counted_from)
+    return results.Match(shown, notes=shown.notes)
 
 
 def value_when(
@@ -531,13 +620,13 @@ def value_when(
     now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, min(now, until))
     name = _resolve_in_days(view, value_topic)
-
-    def show(days: View, match: StoredMessage) -> results.ValueWhen:
-        _note_unsearched(days, match, until, now)
-        return _value_at_match(days, name, match, fields)
-
     search = _Search(condition_topic, condition_type, value, field, min_score, until)
-    return _last_match(view, search, show)
+    found = _last_match(view, search)
+    if isinstance(found, results.Match):
+        return found
+    days, match = found
+    _note_unsearched(days, match, until, now)
+    return _value_at_match(days, name, match, fields)
 
 
 def _value_at_match(
@@ -819,15 +908,10 @@ def _resolve_in_days(view: View, name: str) -> str:
     return resolve_topic(view, name)
 
 
-def _last_match(
-    view: View, search: _Search, show: Callable[[View, StoredMessage], A]
-) -> A | results.Match:
-    """Returns what `show` makes of the last match, or that there is none.
+def _last_match(view: View, search: _Search) -> tuple[View, StoredMessage] | results.Match:
+    """Returns the last match, with the view of the days that have it; or that there is none.
 
-    Args:
-        view: shows the newest days to search.
-        search: what to find.
-        show: makes an answer of the match, and of the view that shows the days of it.
+    `view` shows the newest days to search.
 
     Raises:
         NoDataError: no day has anything that could be searched.
@@ -847,7 +931,7 @@ def _last_match(
             raise out_of_time(days, searched_to + 1) from error
         else:
             if match is not None:
-                return show(days, match)
+                return days, match
             notes += notes_on_days
             missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
         searched_to = days.snapshot.older or searched_to
@@ -924,46 +1008,6 @@ def _search_end(before_s: float | None) -> Ns:
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
-def _newest_at(
-    view: View,
-    topic: str,
-    at: Ns,
-    tolerance_s: float | None,
-    rest_s: float,
-    *,
-    is_pose: bool = False,
-) -> StoredMessage:
-    """Returns the newest message of a topic at or before a moment, within the tolerance (s).
-
-    Without a tolerance given, a latched message may have any age, and a pose of a thinned day holds
-    until the next.
-
-    Raises:
-        NoDataError: there is no such message.
-    """
-    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
-    stored = view.stream.newest(topic, window)
-    if stored is None and tolerance_s is None and is_pose:
-        stored = _thinned_pose(view, topic, window.stop)
-    deleted = False
-    latching = view.limits.latching
-    if stored is None and tolerance_s is None and latching.may_latch(view.snapshot, topic):
-        newest = view.stream.last(topic, window.stop)
-        if newest is None:
-            tolerance = None  # there is none of any age
-        elif latching.holds(view.snapshot, newest):
-            deleted = not still_holds(view, newest, at)
-            if deleted:
-                note_unread(view, TimeWindow(newest.time, window.stop), nothing=True)
-            else:
-                stored = newest
-    if stored is None:
-        raise no_data_at(view, (topic,), at, tolerance, deleted=deleted)
-    note_robots_near(view, stored)
-    note_unread(view, TimeWindow(stored.time, window.stop))
-    return stored
-
-
 def _thinned_pose(view: View, topic: str, stop: Ns) -> StoredMessage | None:
     """Returns the pose of a thinned day that holds just before a log time (ns).
 
@@ -975,19 +1019,6 @@ def _thinned_pose(view: View, topic: str, stop: Ns) -> StoredMessage | None:
         return None
     after = TimeWindow(pose.time + 1, pose.time + _THINNED_POSES_NS)
     return pose if view.stream.first([topic], after) is not None else None
-
-
-def _window_before(
-    view: View, at: Ns, tolerance_s: float | None, rest_s: float
-) -> tuple[TimeWindow, Ns | None]:
-    """Returns the window for a message at a moment, and the tolerance (ns); None for any age."""
-    limit = view.limits.time_tolerance_s if tolerance_s is None else tolerance_s
-    tolerance: Ns | None = ns_argument("tolerance_s", limit)
-    start = at - (tolerance or 0) - START_SLACK_NS
-    if start <= MIN_NS:
-        start, tolerance = MIN_NS, None
-    stop = at + ns_from_unix(rest_s) + AT_OR_BEFORE_SLACK_NS + 1
-    return TimeWindow(start, min(stop, MAX_NS)), tolerance
 
 
 def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
@@ -1019,13 +1050,6 @@ def _with_latched_age(
     return replace(value, latched=True, age=age)
 
 
-def _note_latched(view: View, stored: StoredMessage, at: Ns) -> None:
-    """Notes the age of a latched message, for replies that do not show it."""
-    if still_holds(view, stored, at):
-        age = seconds(max(at - stored.time, 0))
-        view.notes.add(f"{stored.topic} is latched: its value of {age} before is still valid")
-
-
 def _decode_shown(
     view: View, stored: StoredMessage, fields: Sequence[str]
 ) -> tuple[object, Extracted]:
@@ -1046,54 +1070,10 @@ def _as_value(
         stored.topic,
         stored.type,
         Sample(stored.time, shown.value),
-        _age(stored, now),
+        None if now is None else now - stored.time,
         frame_id=view.extractor.frame(message),
         notes=(*view.notes.sentences(), *shown.notes),
     )
-
-
-class _ShownMessage(NamedTuple):
-    """A message as replies show it, with notes on it alone."""
-
-    time: Ns
-    type_name: str
-    value: JsonValue
-    notes: tuple[str, ...]
-
-
-def _show_messages(
-    view: View, messages: Iterable[StoredMessage], fields: Sequence[str]
-) -> tuple[list[_ShownMessage], Counter[str]]:
-    """Returns messages as replies show them, and how often each error kept one from decoding.
-
-    A message without one of the fields, as of another type, is left out with a note.
-
-    Raises:
-        InvalidArgumentsError: no message has the fields.
-    """
-    shown: list[_ShownMessage] = []
-    failures, lacking = Counter[str](), Counter[str]()
-    for message in messages:
-        try:
-            _, extracted = _decode_shown(view, message, fields)
-        except NoDataError as error:
-            failures[error.detail] += 1
-        except InvalidArgumentsError as error:
-            lacking[str(error)] += 1
-        else:
-            shown.append(
-                _ShownMessage(message.time, message.type, extracted.value, extracted.notes)
-            )
-        del message  # frees it before the next one is read
-    for detail, count in lacking.items():
-        if not shown:
-            raise InvalidArgumentsError(detail)
-        view.notes.add(f"{count} samples left out: {detail}")
-    return shown, failures
-
-
-def _age(stored: StoredMessage, now: Ns | None) -> Ns | None:
-    return None if now is None else now - stored.time
 
 
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
