@@ -32,33 +32,27 @@ if TYPE_CHECKING:
     from ros2_memory.demo.robot import Planar
 
 ODOM: Final = "/odom"
-TF: Final = "/tf"
-TF_STATIC: Final = "/tf_static"
-CMD_VEL: Final = "/cmd_vel"
 BATTERY: Final = "/battery_state"
 PATH_CLEAR: Final = "/path_clear"
 SCENE_OBJECTS: Final = "/vision/scene/scene_objects"
 
 
+Body: TypeAlias = "dict[str, object]"
+"""The fields of a message by name; a missing field is zero or empty."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One topic: its type and the time between two messages; a latched one is published once."""
+    """One topic: its type, the time between two messages, and what makes the fields of one.
+
+    A latched one is published once.
+    """
 
     topic: str
     type: str
     period: Ns
+    body: Callable[[Message], Body]
     latched: bool = False
-
-
-STREAMS: Final = (
-    Stream(TF_STATIC, "tf2_msgs/msg/TFMessage", NS_PER_S, latched=True),
-    Stream(ODOM, "nav_msgs/msg/Odometry", 50 * NS_PER_MS),
-    Stream(TF, "tf2_msgs/msg/TFMessage", 50 * NS_PER_MS),
-    Stream(CMD_VEL, "geometry_msgs/msg/Twist", 100 * NS_PER_MS),
-    Stream(PATH_CLEAR, "std_msgs/msg/Bool", 500 * NS_PER_MS),
-    Stream(SCENE_OBJECTS, "ros2_vision_interfaces/msg/VisionDetectionArray", 500 * NS_PER_MS),
-    Stream(BATTERY, "sensor_msgs/msg/BatteryState", NS_PER_S),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,36 +65,6 @@ class Message:
     t: float
 
 
-@dataclass(frozen=True, slots=True)
-class MessageSchedule:
-    """The messages of a robot that started at `t0`, as a recorder receives them from `start` on.
-
-    A latched message was published at `t0` and reaches the recorder at `start`.
-    """
-
-    t0: Ns
-    start: Ns
-
-    def messages(self, stream: Stream) -> Iterator[Message]:
-        """Yields the stream's messages from the start on, without end; one if it is latched."""
-        first = 0 if stream.latched else -((self.t0 - self.start) // stream.period)
-        for k in count(first):
-            published = self.t0 + k * stream.period
-            received = max(published, self.start) + _delay(stream, k)
-            yield Message(stream, received, published, (published - self.t0) / NS_PER_S)
-            if stream.latched:
-                break
-
-    def everything(self) -> Iterator[Message]:
-        """Yields all streams' messages in the order in which they are received, without end."""
-        return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
-
-
-def _delay(stream: Stream, k: int) -> Ns:
-    """Returns the time from publication to the recorder: 0.06 to 0.46 ms, in a fixed pattern."""
-    return (60 + 19 * STREAMS.index(stream) + (k * 7919) % 211) * NS_PER_US
-
-
 VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
         "string label\nfloat32 score\ngeometry_msgs/Point point\n"
@@ -110,14 +74,11 @@ VISION_DEFINITIONS: Final = {
     ),
 }
 
-Body: TypeAlias = "dict[str, object]"
-"""The fields of a message by name; a missing field is zero or empty."""
-
 
 def payload(message: Message) -> bytes:
     """Returns the message in CDR, as it is published."""
     name = message.stream.type
-    body = _BODIES[message.stream.topic](message)
+    body = message.stream.body(message)
     return bytes(_typestore().serialize_cdr(_ros_message(name, body), name))
 
 
@@ -222,13 +183,51 @@ def _battery(message: Message) -> Body:
     }
 
 
-_BODIES: Final[Mapping[str, Callable[[Message], Body]]] = {
-    TF_STATIC: _static_transforms,
-    ODOM: _odometry,
-    TF: _robot_transform,
-    CMD_VEL: _twist,
-    PATH_CLEAR: lambda message: {"data": robot.path_clear(message.t)},
-    SCENE_OBJECTS: _detections,
-    BATTERY: _battery,
-}
-"""The functions that make the fields of a message, by topic."""
+def _path_clear(message: Message) -> Body:
+    return {"data": robot.path_clear(message.t)}
+
+
+STREAMS: Final = (
+    Stream("/tf_static", "tf2_msgs/msg/TFMessage", NS_PER_S, _static_transforms, latched=True),
+    Stream(ODOM, "nav_msgs/msg/Odometry", 50 * NS_PER_MS, _odometry),
+    Stream("/tf", "tf2_msgs/msg/TFMessage", 50 * NS_PER_MS, _robot_transform),
+    Stream("/cmd_vel", "geometry_msgs/msg/Twist", 100 * NS_PER_MS, _twist),
+    Stream(PATH_CLEAR, "std_msgs/msg/Bool", 500 * NS_PER_MS, _path_clear),
+    Stream(
+        SCENE_OBJECTS,
+        "ros2_vision_interfaces/msg/VisionDetectionArray",
+        500 * NS_PER_MS,
+        _detections,
+    ),
+    Stream(BATTERY, "sensor_msgs/msg/BatteryState", NS_PER_S, _battery),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageSchedule:
+    """The messages of a robot that started at `t0`, as a recorder receives them from `start` on.
+
+    A latched message was published at `t0` and reaches the recorder at `start`.
+    """
+
+    t0: Ns
+    start: Ns
+
+    def messages(self, stream: Stream) -> Iterator[Message]:
+        """Yields the stream's messages from the start on, without end; one if it is latched."""
+        first = 0 if stream.latched else -((self.t0 - self.start) // stream.period)
+        for k in count(first):
+            published = self.t0 + k * stream.period
+            received = max(published, self.start) + _delay(stream, k)
+            yield Message(stream, received, published, (published - self.t0) / NS_PER_S)
+            if stream.latched:
+                break
+
+    def everything(self) -> Iterator[Message]:
+        """Yields all streams' messages in the order in which they are received, without end."""
+        return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
+
+
+def _delay(stream: Stream, k: int) -> Ns:
+    """Returns the time from publication to the recorder: 0.06 to 0.46 ms, in a fixed pattern."""
+    return (60 + 19 * STREAMS.index(stream) + (k * 7919) % 211) * NS_PER_US

@@ -29,6 +29,10 @@ _ROUNDED: Final = 1e-3
 """How much (m, m/s) a right number may be off: its rounding, with some room."""
 _LATE_S: Final = 1.5
 """How much older a message may be than the asked time: the battery reports once a second."""
+LOOK_BACK_S: Final = 60
+"""The longest window that a question is about."""
+_AGO_S: Final = 10
+_CAMERA_TOPIC: Final = "/camera/image_raw"
 _PERIODS: Final = {stream.topic: stream.period for stream in STREAMS}
 
 
@@ -238,51 +242,39 @@ def _objects(t: float) -> JsonObject:
     return {"value": {"detections": [{"label": thing.label} for thing in robot.seen(t)]}}
 
 
-def _distance_judge(seconds: float) -> Judge:
-    """Returns a judge of the distance driven in the last seconds, so far as files are closed."""
-
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        start_s, end_s = _number(reply, "start"), _number(reply, "end")
-        call.require_ago(start_s - _LATE_S, seconds)
-        before, after = (robot.driven(call.robot_time(at, ODOM)) for at in (start_s, end_s))
-        metres = after - before
-        _require(reply, {"distance_m": metres}, off=0.01 * (1 + metres))
-        return (
-            f"{metres:.2f} m, at up to {_number(reply, 'max_speed'):.2f} m/s, in the "
-            f"{end_s - start_s:.1f} s of it that are in closed files."
-        )
-
-    return judge
+def _judge_distance(reply: JsonValue, call: CallContext) -> str:
+    """Judges the distance driven in the last `LOOK_BACK_S`, so far as files are closed."""
+    start_s, end_s = _number(reply, "start"), _number(reply, "end")
+    call.require_ago(start_s - _LATE_S, LOOK_BACK_S)
+    before, after = (robot.driven(call.robot_time(at, ODOM)) for at in (start_s, end_s))
+    metres = after - before
+    _require(reply, {"distance_m": metres}, off=0.01 * (1 + metres))
+    return (
+        f"{metres:.2f} m, at up to {_number(reply, 'max_speed'):.2f} m/s, in the "
+        f"{end_s - start_s:.1f} s of it that are in closed files."
+    )
 
 
-def _camera_judge(seconds_ago: float) -> Judge:
-    """Returns a judge of the pose of the camera in `map` at a time, through four frames."""
-
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment_s = _number(reply, "timestamp")
-        call.require_ago(moment_s, seconds_ago)
-        t = (ns_from_unix(moment_s) - call.t0) / NS_PER_S
-        ahead, aside, height = robot.CAMERA
-        x, y, yaw = robot.pose_in_map(t).then(Planar(ahead, aside, 0.0))
-        position: JsonValue = {"x": x, "y": y, "z": height}
-        expected = {"translation": position, "yaw_deg": math.degrees(yaw)}
-        _require(reply, expected, off=5e-3, off_deg=0.2)  # between two transforms
-        return (
-            f"In the {room_at(x)}, {x:.2f} m east and {y:.2f} m north of the flat's corner, "
-            f"{height:.2f} m high."
-        )
-
-    return judge
+def _judge_camera(reply: JsonValue, call: CallContext) -> str:
+    """Judges the pose of the camera in `map` `_AGO_S` ago, through four frames."""
+    moment_s = _number(reply, "timestamp")
+    call.require_ago(moment_s, _AGO_S)
+    t = (ns_from_unix(moment_s) - call.t0) / NS_PER_S
+    ahead, aside, height = robot.CAMERA
+    x, y, yaw = robot.pose_in_map(t).then(Planar(ahead, aside, 0.0))
+    position: JsonValue = {"x": x, "y": y, "z": height}
+    expected = {"translation": position, "yaw_deg": math.degrees(yaw)}
+    _require(reply, expected, off=5e-3, off_deg=0.2)  # between two transforms
+    return (
+        f"In the {room_at(x)}, {x:.2f} m east and {y:.2f} m north of the flat's corner, "
+        f"{height:.2f} m high."
+    )
 
 
-def _not_recorded_judge(topic: str) -> Judge:
-    """Returns a judge of the reply that a topic was never recorded, which is an answer, too."""
-
-    def judge(reply: JsonValue, _call: CallContext) -> str:
-        _require(reply, {"error": "no_data", "reason": "topic_not_recorded"})
-        return f"{topic} was never recorded, and the answer says so."
-
-    return judge
+def _judge_pictures(reply: JsonValue, _call: CallContext) -> str:
+    """Judges the reply that a topic was never recorded, which is an answer, too."""
+    _require(reply, {"error": "no_data", "reason": "topic_not_recorded"})
+    return f"{_CAMERA_TOPIC} was never recorded, and the answer says so."
 
 
 def _is_near(place: Planar) -> Callable[[float], bool]:
@@ -296,8 +288,8 @@ def _is_near(place: Planar) -> Callable[[float], bool]:
     return holds
 
 
-def _sees(label: str) -> Callable[[float], bool]:
-    return lambda t: any(thing.label == label for thing in robot.seen(t))
+def _sees_scissors(t: float) -> bool:
+    return any(thing.label == "scissors" for thing in robot.seen(t))
 
 
 def _in_odom(place: Planar) -> Planar:
@@ -311,9 +303,6 @@ def _near_condition(place: Planar) -> Mapping[str, JsonValue]:
     return {"condition_type": "near_position", "value": {"x": round(x, 3), "y": round(y, 3)}}
 
 
-LOOK_BACK_S: Final = 60
-"""The longest window that a question is about."""
-_CAMERA_TOPIC: Final = "/camera/image_raw"
 _SCISSORS: Final = {"condition_type": "contains", "value": "scissors"}
 
 QUESTIONS: Final = (
@@ -321,14 +310,14 @@ QUESTIONS: Final = (
     Question(
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
-        {"seconds_ago": 10},
-        _message_judge(ODOM, _pose, "{place}, facing {facing}.", ago=10),
+        {"seconds_ago": _AGO_S},
+        _message_judge(ODOM, _pose, "{place}, facing {facing}.", ago=_AGO_S),
     ),
     Question(
         "And how fast?",
         "get_velocity_seconds_ago",
-        {"seconds_ago": 10},
-        _message_judge(ODOM, _twist, "{motion}.", ago=10),
+        {"seconds_ago": _AGO_S},
+        _message_judge(ODOM, _twist, "{motion}.", ago=_AGO_S),
     ),
     Question(
         "What objects did you see at the front door?",
@@ -358,7 +347,7 @@ QUESTIONS: Final = (
         "How far have I driven in the last minute?",
         "recent_trajectory_summary",
         {"seconds": LOOK_BACK_S},
-        _distance_judge(LOOK_BACK_S),
+        _judge_distance,
     ),
     Question(
         "When did you last see scissors?",
@@ -368,7 +357,7 @@ QUESTIONS: Final = (
             SCENE_OBJECTS,
             lambda t: {"topic": SCENE_OBJECTS, **_objects(t)},
             "{when}; in view: {objects}.",
-            holds=_sees("scissors"),
+            holds=_sees_scissors,
         ),
     ),
     Question(
@@ -379,7 +368,7 @@ QUESTIONS: Final = (
             SCENE_OBJECTS,
             _at_position,
             "{place}, {when}.",
-            holds=_sees("scissors"),
+            holds=_sees_scissors,
             value_topic=ODOM,
         ),
     ),
@@ -392,8 +381,8 @@ QUESTIONS: Final = (
     Question(
         "Where in the flat was the camera 10 s ago?",
         "get_transform_seconds_ago",
-        {"parent": "map", "child": "camera", "seconds_ago": 10},
-        _camera_judge(10),
+        {"parent": "map", "child": "camera", "seconds_ago": _AGO_S},
+        _judge_camera,
     ),
     Question(
         "How full was the battery half a minute ago?",
@@ -410,7 +399,7 @@ QUESTIONS: Final = (
     Question(
         "What did the camera's pictures show?",
         "get_topic_seconds_ago",
-        {"topic": _CAMERA_TOPIC, "seconds_ago": 10},
-        _not_recorded_judge(_CAMERA_TOPIC),
+        {"topic": _CAMERA_TOPIC, "seconds_ago": _AGO_S},
+        _judge_pictures,
     ),
 )

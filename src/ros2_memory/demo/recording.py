@@ -8,7 +8,6 @@ a message arrives more than the split duration after its first message.
 from __future__ import annotations
 
 import threading
-from contextlib import AbstractContextManager
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
@@ -34,12 +33,12 @@ _FOR_EVER: Final[JsonObject] = {
 _STOP_WITHIN_S: Final = 10.0
 
 
-class DemoRecorder(AbstractContextManager["DemoRecorder"]):
+class DemoRecorder:
     """Writes the messages of a `MessageSchedule` into a directory, each when it is received.
 
     Messages of the past are written at once. The directory must not exist (as with
     `ros2 bag record`); its name is the recording's. A thread records from the constructor until
-    `stop`, or until the block of the context manager ends.
+    `stop`.
 
     Attributes:
         directory: the recording.
@@ -67,9 +66,6 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
         self._thread = threading.Thread(target=self._record, name="demo-recorder", daemon=True)
         self._thread.start()
         self._caught_up.wait()
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def stop(self) -> None:
         """Ends the recording as a clean shutdown does: a footer, and metadata.yaml."""

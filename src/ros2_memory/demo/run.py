@@ -236,7 +236,7 @@ def run_demo(
         recorder = DemoRecorder(folder / name, schedule, split_duration_s=SPLIT_DURATION_S)
         if recorder.failure is not None:
             raise recorder.failure
-        stack.enter_context(recorder)
+        stack.callback(recorder.stop)
         server, url = stack.enter_context(running_server(folder, port))
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
