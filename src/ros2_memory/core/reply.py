@@ -337,6 +337,18 @@ class Declared(Protocol):
     reply: ClassVar[Keys]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerWithNotes:
+    """The base of most answers.
+
+    `notes` are sentences on what was downsampled, left out, clamped or could not be read.
+    """
+
+    notes: tuple[str, ...] = ()
+
+    reply: ClassVar[Keys]
+
+
 def keys(*declared: str | Key, span: tuple[Source, Source] | None = None) -> Keys:
     """Returns the keys of an object; a text declares the attribute of that name, shown as it is.
 

@@ -11,8 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.reply import PLAIN, TIME, JsonObject, result
-from ros2_memory.results.base import AnswerWithNotes
+from ros2_memory.core.reply import PLAIN, TIME, AnswerWithNotes, JsonObject, result
 from ros2_memory.results.memory import (
     ANOTHER,
     Budget,

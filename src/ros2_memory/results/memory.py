@@ -17,6 +17,7 @@ from ros2_memory.core.reply import (
     PLAIN,
     SECONDS,
     TIME,
+    AnswerWithNotes,
     an_object,
     digits,
     keys,
@@ -26,7 +27,6 @@ from ros2_memory.core.reply import (
     unit,
 )
 from ros2_memory.core.text import counted
-from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:

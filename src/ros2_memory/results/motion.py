@@ -22,6 +22,7 @@ from ros2_memory.core.reply import (
     TOTAL,
     XYZ,
     YAW,
+    AnswerWithNotes,
     Keys,
     an_object,
     digits,
@@ -31,7 +32,6 @@ from ros2_memory.core.reply import (
     vector,
 )
 from ros2_memory.core.timebase import Ns, unix_from_ns
-from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint

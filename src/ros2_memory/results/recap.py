@@ -21,6 +21,7 @@ from ros2_memory.core.reply import (
     TENTHS_OF_S_AGO,
     TIME,
     TOTAL,
+    AnswerWithNotes,
     LocalTimes,
     an_object,
     digits,
@@ -31,7 +32,6 @@ from ros2_memory.core.reply import (
     unit,
 )
 from ros2_memory.core.timebase import Ns, unix_from_ns
-from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

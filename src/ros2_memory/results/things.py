@@ -19,6 +19,7 @@ from ros2_memory.core.reply import (
     TOTAL,
     YAW,
     Absent,
+    AnswerWithNotes,
     JsonObject,
     Keys,
     Scope,
@@ -36,7 +37,6 @@ from ros2_memory.core.reply import (
     vector,
 )
 from ros2_memory.core.text import named, shortened
-from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, Vector3

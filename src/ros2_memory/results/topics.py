@@ -22,6 +22,7 @@ from ros2_memory.core.reply import (
     TOTAL,
     XYZ,
     Absent,
+    AnswerWithNotes,
     JsonObject,
     LocalTimes,
     Scope,
@@ -40,7 +41,6 @@ from ros2_memory.core.reply import (
 )
 from ros2_memory.core.text import dotted, named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
-from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
