@@ -783,7 +783,7 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
 
         # Series of when each counter began, which this format has no use for, in all registries.
         disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
-        metrics = Metrics(MemoryGauges(memory), package_version())
+        metrics = Metrics(MemoryGauges(memory))
         observers.append(metrics)
         exposition = metrics.exposition
     if settings.server.traces:

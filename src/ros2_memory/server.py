@@ -244,7 +244,7 @@ def _parts_of_one(
             tasks.start_soon(keep_fresh, memory, every_s)
             tasks.start_soon(keep_backfilled, backfill, every_s)
 
-    return _Parts(server, Health(memory, package_version(), backfill), background, page)
+    return _Parts(server, Health(memory, backfill), background, page)
 
 
 def _parts_of_fleet(
@@ -278,7 +278,7 @@ def _parts_of_fleet(
     for name in settings.fleet.robots:  # the others have bags in the lake alone
         robot = fleet.robots[name]
         bags = robot.own or robot.memory
-        reports[name] = Health(bags, package_version(), backfill_of(name))
+        reports[name] = Health(bags, backfill_of(name))
 
     async def background() -> None:
         """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
@@ -288,7 +288,7 @@ def _parts_of_fleet(
             tasks.start_soon(keep_all_backfilled, all_backfills, every_s)
 
     server = build_server(settings, memory, telemetry, fleet=fleet)
-    return _Parts(server, FleetHealth(reports, package_version()), background, None)
+    return _Parts(server, FleetHealth(reports), background, None)
 
 
 def _parser() -> argparse.ArgumentParser:

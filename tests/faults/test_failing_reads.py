@@ -102,14 +102,14 @@ async def test_a_disk_that_fails_under_a_running_memory_loses_nothing(
     with failing(monkeypatch, functions) as disk:
         disk.fail(number)
         answers = ask_honest(memory, right)
-        told_health = await Health(memory, "1")()
+        told_health = await Health(memory)()
         disk.heal()
     if functions is LOOK:
         assert told_health["status"] == "degraded"
         assert not [each for each in answers if "was deleted" in each]
     clock.at += RETRY_SOON_NS
     assert told(memory, count=COUNT) == right
-    assert (await Health(memory, "1")())["status"] == "ok"
+    assert (await Health(memory)())["status"] == "ok"
 
 
 def test_a_disk_that_fails_while_bags_are_stored_has_them_stored_later(

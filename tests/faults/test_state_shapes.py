@@ -184,10 +184,10 @@ async def test_nothing_more_is_served_or_deleted(
     assert served(root) <= right[0]
     memory = memory_of(root, clock=CLOCK)
     memory_status(memory, Call())
-    health = Health(memory, "1")
+    health = Health(memory)
     json.dumps(await health(), ensure_ascii=False).encode()
     health.stop()
-    metrics = Metrics(MemoryGauges(memory), "1", timeout_s=60)
+    metrics = Metrics(MemoryGauges(memory), timeout_s=60)
     assert b"ros2_memory_bags" in (await metrics.exposition()).body
     metrics.stop()
     assert deleted(root) <= right[1]

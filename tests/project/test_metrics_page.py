@@ -42,7 +42,7 @@ def shown(bag_dir: Path) -> dict[str, dict[str, set[str]]]:
     kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
     memory = memory_of(bag_dir, limits=QuerySettings(kept=kept))
     memory.index.refresh()
-    metrics = Metrics(MemoryGauges(memory), "1")
+    metrics = Metrics(MemoryGauges(memory))
     metrics.answered(CALL)
     exposition = anyio.run(metrics.exposition).body.decode()
     metrics.stop()

@@ -22,6 +22,7 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import generate_latest
 
+from ros2_memory import package_version
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import Answered, Exposition, Observer
@@ -52,11 +53,9 @@ class Metrics(Observer):
     def __init__(
         self,
         measure: Callable[[], Sequence[Metric]],
-        version: str,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
         self._measure = measure
-        self._version = version
         self._timeout_s = timeout_s
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="metrics")
         self._measuring: asyncio.Future[Sequence[Metric]] | None = None
@@ -113,7 +112,7 @@ class Metrics(Observer):
     def collect(self) -> Iterator[Metric]:
         """Yields the version and the gauges of the memory, for the registry."""
         yield InfoMetricFamily(
-            "ros2_memory_build", "The version of this server.", {"version": self._version}
+            "ros2_memory_build", "The version of this server.", {"version": package_version()}
         )
         yield from self._gauges
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import anyio.to_thread
 
+from ros2_memory import package_version
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -80,9 +81,8 @@ class Health:
     that hangs must not cost a thread with every request.
     """
 
-    def __init__(self, memory: Memory, version: str, backfill: Backfill | None = None) -> None:
-        self._report = partial(_health_report, memory, version, backfill)
-        self._version = version
+    def __init__(self, memory: Memory, backfill: Backfill | None = None) -> None:
+        self._report = partial(_health_report, memory, backfill)
         self._queue = FairQueue("health", 1)
 
     def stop(self) -> None:
@@ -97,7 +97,7 @@ class Health:
         """
         with anyio.move_on_after(TIMEOUT_S), suppress(BusyError):
             return await self._queue.run(None, self._report)
-        return _status(self._version, ["the bag directory is being scanned"], {})
+        return _status(["the bag directory is being scanned"], {})
 
 
 @dataclass
@@ -105,7 +105,6 @@ class FleetHealth:
     """Reports the state of a fleet's server: the robots' states, each by its own `Health`."""
 
     _robots: Mapping[str, Health]
-    _version: str
 
     def stop(self) -> None:
         """Ends the threads when they are done."""
@@ -127,10 +126,10 @@ class FleetHealth:
             robots[name] = {
                 key: value for key, value in report.items() if key not in {"version", "pid"}
             }
-        return _status(self._version, problems, {"robots": robots})
+        return _status(problems, {"robots": robots})
 
 
-def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
+def _health_report(memory: Memory, backfill: Backfill | None) -> JsonObject:
     """Returns what `/health` shows of one memory."""
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
@@ -168,7 +167,7 @@ def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> J
             problems.append(_short(f"the store of columns {trouble}; no answer depends on it"))
     if heartbeat is not None:
         shown["recorder"] = _recorder_state(heartbeat, now)
-    return _status(version, problems, shown)
+    return _status(problems, shown)
 
 
 def _gaps_last_hour(memory: Memory, now: Ns) -> JsonObject:
@@ -233,12 +232,12 @@ def _recorder_state(heartbeat: Heartbeat, now: Ns) -> JsonObject:
     return shown
 
 
-def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
+def _status(problems: list[str], shown: JsonObject) -> JsonObject:
     """Returns a report: the status and its problems come before all that is `shown`."""
     status: JsonObject = {"status": "ok"}
     if problems:
         status = {"status": "degraded", "problems": [*problems]}
-    return {**status, "version": version, "pid": os.getpid(), **shown}
+    return {**status, "version": package_version(), "pid": os.getpid(), **shown}
 
 
 def _short(text: str) -> str:

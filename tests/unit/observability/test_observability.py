@@ -17,6 +17,7 @@ from opentelemetry.sdk.trace import ReadableSpan
 from prometheus_client.metrics_core import Metric
 from structlog.testing import capture_logs
 
+from ros2_memory import package_version
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
@@ -71,7 +72,7 @@ def at(found: Samples, name: str, **labels: str) -> float:
 
 
 async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole() -> None:
-    metrics = Metrics(lambda: (), "1")
+    metrics = Metrics(lambda: ())
     full = tool("full", lambda _: value(7))
     dispatcher = served(full, telemetry=Telemetry((metrics,))).dispatcher
     hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
@@ -95,7 +96,7 @@ async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None
         freed.wait()
         return [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
 
-    metrics = Metrics(hanging, "1", timeout_s=0.01)
+    metrics = Metrics(hanging, timeout_s=0.01)
     metrics.answered(Answered("ask", "ok", 0.03, 12, "abc", {}))
     try:
         for _ in range(2):
@@ -111,7 +112,7 @@ async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone() -> None
 async def test_a_measurement_that_fails_is_logged_and_costs_the_figures_of_the_memory_alone(
     fault: Exception,
 ) -> None:
-    metrics = Metrics(Mock(side_effect=fault), "1")
+    metrics = Metrics(Mock(side_effect=fault))
     metrics.answered(Answered("ask", "ok", 0.03, 12, "abc", {}))
     with capture_logs() as captured:
         found = await scraped(metrics)
@@ -119,14 +120,14 @@ async def test_a_measurement_that_fails_is_logged_and_costs_the_figures_of_the_m
     assert [event["event"] for event in captured] == ["metrics_not_measured"]
     metrics.stop()
     # As a scrape may find it while the server ends.
-    assert at(await scraped(metrics), "build_info", version="1") == 1
+    assert at(await scraped(metrics), "build_info", version=package_version()) == 1
 
 
 def test_metrics_of_other_libraries_stay_as_they_are() -> None:
     enable_created_metrics()  # type: ignore[no-untyped-call]
     registry = CollectorRegistry()
     Counter("other", "Of another library.", registry=registry)
-    Metrics(lambda: (), "1").stop()
+    Metrics(lambda: ()).stop()
     assert "other_created" in generate_latest(registry).decode()
 
 

@@ -237,7 +237,7 @@ def test_status_and_health_say_how_much_foreign_bags_take(mixed: Mixed) -> None:
     budget = memory_status(memory, Call()).budget
     assert budget.used - budget.state == bytes_of(mine)
     assert budget.foreign == bytes_of([*others, broken])
-    assert anyio.run(Health(memory, "1"))["foreign_bytes"] == budget.foreign
+    assert anyio.run(Health(memory))["foreign_bytes"] == budget.foreign
     # They follow the list and the bags.
     own_all(bag_dir)
     assert memory_status(memory, Call()).budget.foreign == bytes_of([loose])
@@ -253,7 +253,7 @@ def test_nothing_is_reported_where_it_is_not_known_or_does_not_matter(tmp_path: 
     every = memory_in(tmp_path, keeps_foreign=False)
     assert memory_status(every, Call()).budget.foreign is None
     assert memory_status(memory_of(tmp_path), Call()).budget.foreign is None
-    assert "foreign_bytes" not in anyio.run(Health(every, "1"))
+    assert "foreign_bytes" not in anyio.run(Health(every))
 
 
 def test_doctor_and_info_say_how_much_foreign_bags_take(

@@ -181,9 +181,9 @@ async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
         bag(tmp_path, number)
     memory, backfill = storing(tmp_path)
     backfill.store(Batch(backfill.waiting()[:1], Level.BAG))
-    reply = await Health(memory, "1.2.3", backfill)()
+    reply = await Health(memory, backfill)()
     assert reply["store"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
     assert backfill.filling is not None
     backfill.filling.store.refusals, backfill.filling.store.refused_for = 2, "too large"
-    reply = await Health(memory, "1.2.3", backfill)()
+    reply = await Health(memory, backfill)()
     assert reply["store_refusals"] == {"count": 2, "reason": "too large"}

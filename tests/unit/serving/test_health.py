@@ -11,6 +11,7 @@ import anyio.lowlevel
 import pytest
 from structlog.testing import capture_logs
 
+from ros2_memory import package_version
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
@@ -30,10 +31,10 @@ def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
 
 
 async def test_an_empty_memory_is_healthy_and_a_live_recorder_is_shown(tmp_path: Path) -> None:
-    health = Health(memory_at(tmp_path, seconds=3), "1.2.3")
+    health = Health(memory_at(tmp_path, seconds=3))
     assert await health() == {
         "status": "ok",
-        "version": "1.2.3",
+        "version": package_version(),
         "pid": os.getpid(),
         "bags": 0,
         "earliest": None,
@@ -76,7 +77,7 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
     (tmp_path / "r" / "r_1.db3").write_bytes(b"of another storage")
     for number in range(5):
         write_mcap(tmp_path / "boot" / f"boot_{number}.mcap", [text(number, "a")])
-    reply = await Health(memory_of(tmp_path), "1")()
+    reply = await Health(memory_of(tmp_path))()
     assert reply["status"] == "ok"
     counts = {what: reply[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
     assert counts == {"damaged": 0, "incomplete": 1, "unread": 1, "clock_faults": 5}
@@ -87,7 +88,7 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
 
 async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
-    reply = await Health(memory_at(tmp_path, seconds=-3600), "1")()
+    reply = await Health(memory_at(tmp_path, seconds=-3600))()
     assert reply["problems"] == [
         "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
     ]
@@ -98,12 +99,12 @@ async def test_a_machine_that_booted_without_its_time_says_so_until_it_has_it(
 ) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
     write_mcap(tmp_path / "boot" / "boot_0.mcap", [text(95 * NS_PER_S, "a")])
-    booted = await Health(memory_at(tmp_path, seconds=100 - T0 // NS_PER_S), "1")()
+    booted = await Health(memory_at(tmp_path, seconds=100 - T0 // NS_PER_S))()
     assert booted["problems"] == [
         "the clock of this machine is not set: bags are dated years after now"
     ]
     assert booted["latest"] == T0 / NS_PER_S
-    assert (await Health(memory_at(tmp_path, seconds=3), "1")())["status"] == "ok"
+    assert (await Health(memory_at(tmp_path, seconds=3))())["status"] == "ok"
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ async def test_a_recorder_that_does_not_record_degrades_it_unless_it_was_stopped
     tmp_path: Path, state: RecorderState, seconds: int, problems: list[str] | None
 ) -> None:
     beat(tmp_path, T0, state, last_error="disk full")
-    reply = await Health(memory_at(tmp_path, seconds=seconds), "1")()
+    reply = await Health(memory_at(tmp_path, seconds=seconds))()
     assert reply["status"] == ("degraded" if problems else "ok")
     assert reply.get("problems") == problems
 
@@ -139,7 +140,7 @@ async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
 
     memory = memory_at(tmp_path)
     index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    health = Health(replace(memory, index=index), "1")
+    health = Health(replace(memory, index=index))
     before = threading.active_count()
     reply = [await health() for _ in range(10)]
     during = threading.active_count()
@@ -187,7 +188,7 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
         unheard=names[:5],
         required_missing=names[:7],
     )
-    said: Any = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    said: Any = await Health(memory_at(tmp_path, seconds=3600))()
     assert len(json.dumps(said)) < 14_000
     assert (said["status"], said["damaged"]) == ("degraded", 50)
     assert said["problems"][0] == "50 damaged bag files; data_time_range lists them"
@@ -209,7 +210,7 @@ async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Pat
         required_missing=("/odom: it came regularly, and is silent",),
         advice="look at the users",
     )
-    report: Any = await Health(memory_at(tmp_path), "1.2.3")()
+    report: Any = await Health(memory_at(tmp_path))()
     assert report["status"] == "degraded"
     assert report["problems"] == [
         "required, and not recorded: /odom: it came regularly, and is silent",
