@@ -115,25 +115,19 @@ def ask(
                 call = Call(Deadline.after(loaded.server.call_timeout_s))
                 memory = fleet.newest(robot, call) or memory
         reply = answer_to(dispatcher, memory, name, arguments)
-    answer: JsonValue = json.loads(reply.text)
+    parse_float = _plain_number if name == _QUERY_LAKE else float
+    answer: JsonValue = json.loads(reply.text, parse_float=parse_float)
     if as_json:
         print_line(reply.text)
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(_with_plain_cells(answer) if name == _QUERY_LAKE else answer)
+        print_reply(answer)
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
-def _with_plain_cells(answer: JsonValue) -> JsonValue:
-    """Returns a reply to a SELECT whose rows have no float that looks like a time."""
-    rows = answer.get("rows") if isinstance(answer, dict) else None
-    if not isinstance(answer, dict) or not isinstance(rows, list):
-        return answer
-    plain: list[JsonValue] = [
-        [*map(plain_cell, row)] if isinstance(row, list) else row for row in rows
-    ]
-    return answer | {"rows": plain}
+def _plain_number(text: str) -> JsonValue:
+    return plain_cell(float(text))
 
 
 def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:

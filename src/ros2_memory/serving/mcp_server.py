@@ -193,7 +193,9 @@ class EpisodicServer(MCPServer[object]):
 
         Meanwhile a client that asks for progress receives it every `PROGRESS_EVERY_S`.
         """
-        _drop_body(context)
+        request = _http_request(context)
+        if request is not None:
+            request._body = b""  # it was parsed, and Starlette would keep it during the call
         async with anyio.create_task_group() as tasks:
             if isinstance(context, Context):
                 meta = context.request_context.meta or {}
@@ -202,9 +204,9 @@ class EpisodicServer(MCPServer[object]):
             reply = await self.dispatcher.answer(
                 name,
                 arguments,
-                _client(context),
-                for_page=_is_page(context),
-                robots=_robots(context),
+                _client(request),
+                for_page=_is_page(request),
+                robots=_robots(request),
             )
             tasks.cancel_scope.cancel()
         return CallToolResult(
@@ -242,8 +244,9 @@ class EpisodicServer(MCPServer[object]):
         if str(uri) == VIEW_URI:
             return [view()]
         name, arguments = self._resource_call(str(uri))
+        request = _http_request(context)
         reply = await self.dispatcher.answer(
-            name, arguments, _client(context), for_resource=True, robots=_robots(context)
+            name, arguments, _client(request), for_resource=True, robots=_robots(request)
         )
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
@@ -302,13 +305,12 @@ def _http_request(context: object) -> Request | None:
     return request if isinstance(request, Request) else None
 
 
-def _client(context: object) -> Hashable:
+def _client(request: Request | None) -> Hashable:
     """Returns an identity of the client: its session, or else its address and program.
 
     None over stdio, which has one client. It only serves to give out turns fairly: a client may
     claim to be another.
     """
-    request = _http_request(context)
     if request is None:
         return None
     session = request.query_params.get("session_id")
@@ -319,22 +321,13 @@ def _client(context: object) -> Hashable:
     return address, name[:_LONGEST_NAME]
 
 
-def _drop_body(context: object) -> None:
-    """Frees the body of a request, which was parsed: Starlette would keep it during the call."""
-    request = _http_request(context)
-    if request is not None:
-        request._body = b""
-
-
-def _robots(context: object) -> frozenset[str] | None:
+def _robots(request: Request | None) -> frozenset[str] | None:
     """Returns the robots that the token of a request is for; None for all."""
-    request = _http_request(context)
     return None if request is None else robots_of(request.scope)
 
 
-def _is_page(context: object) -> bool:
+def _is_page(request: Request | None) -> bool:
     """Returns whether the server's own page asks: only browsers name the site of a request."""
-    request = _http_request(context)
     return request is not None and request.headers.get("sec-fetch-site") == "same-origin"
 
 

@@ -64,8 +64,8 @@ def page_routes(
     return [
         page.route(SPAN_PATH, page.span),
         page.route(MOMENT_PATH, moment_reply),
-        page.route("/page/topics", _topics),
-        page.route("/page/labels", _labels),
+        page.route("/page/topics", _in_window(topics_shown)),
+        page.route("/page/labels", _in_window(labels_shown)),
         page.route("/page/path", _path),
     ]
 
@@ -123,12 +123,8 @@ class _PageData:
         return shown
 
 
-def _topics(given: QueryParams, part: Memory, call: Call) -> JsonObject:
-    return topics_shown(part, call, requested_window(given))
-
-
-def _labels(given: QueryParams, part: Memory, call: Call) -> JsonObject:
-    return labels_shown(part, call, requested_window(given))
+def _in_window(work: Callable[[Memory, Call, TimeWindow], JsonObject]) -> _Work:
+    return lambda given, part, call: work(part, call, requested_window(given))
 
 
 def _path(given: QueryParams, part: Memory, call: Call) -> JsonObject:
