@@ -28,8 +28,7 @@ from ros2_memory.bag_dir.handover_file import (
     sure_handover,
 )
 from ros2_memory.bag_dir.json_files import until_changed
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER, recorded_as
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -216,7 +215,7 @@ class BagDirReader(BagReader):
         """
         if self.bag_dir is None or os.path.lexists(path):
             return self._confined(path)
-        recorded = Path(HardLinks(self.bag_dir).recorded_as(str(path)))
+        recorded = Path(recorded_as(self.bag_dir, str(path)))
         name = os.path.relpath(recorded, self.bag_dir)
         links = [recorded]
         with suppress(OSError):

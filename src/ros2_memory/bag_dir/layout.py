@@ -27,6 +27,7 @@ No name here has the suffix of a bag, so the index ignores these files.
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from contextlib import suppress
@@ -133,6 +134,19 @@ def is_kept_apart(name: str) -> bool:
     They are no recordings.
     """
     return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER, MEMORY_FOLDER}
+
+
+def is_saved(bag_dir: Path, path: str) -> bool:
+    """Whether a path lies in the folder of the saved moments."""
+    return path.startswith(f"{str(bag_dir).rstrip('/')}/{MOMENTS_FOLDER}/")
+
+
+def recorded_as(bag_dir: Path, path: str) -> str:
+    """Returns the path where a saved moment's bag was recorded; any other path unchanged."""
+    if not is_saved(bag_dir, path):
+        return path
+    _, slash, name = os.path.relpath(path, bag_dir / MOMENTS_FOLDER).partition("/")
+    return str(bag_dir / name) if slash else path
 
 
 def utc_stamp(at: Ns) -> str:

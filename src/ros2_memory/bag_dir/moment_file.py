@@ -50,25 +50,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class HardLinks:
-    """The paths of saved moments in one bag directory, as strings."""
-
-    def __init__(self, bag_dir: Path) -> None:
-        self._root = f"{str(bag_dir).rstrip('/')}/"
-        self._moments = f"{self._root}{MOMENTS_FOLDER}/"
-
-    def is_saved(self, path: str) -> bool:
-        """Whether a path lies in the folder of the saved moments."""
-        return path.startswith(self._moments)
-
-    def recorded_as(self, path: str) -> str:
-        """Returns the path where a saved moment's bag was recorded; any other path unchanged."""
-        if not self.is_saved(path):
-            return path
-        _, slash, name = path[len(self._moments) :].partition("/")
-        return f"{self._root}{name}" if slash else path
-
-
 _log = get_logger(__name__)
 
 FORMAT: Final = 1

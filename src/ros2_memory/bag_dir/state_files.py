@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import partial
-from itertools import chain, starmap
+from itertools import chain
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
@@ -60,7 +60,7 @@ from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
@@ -374,41 +374,31 @@ class Thinned:
 
         The day is a date in UTC, as `20261120`.
         """
-
-        def stays(time: Ns) -> bool:
-            return utc_day(time) >= day
-
-        silences = tuple(
-            (topic, first, last, length, goes_on)
-            for topic, first, last, length, goes_on in self.silences
-            if stays(first if goes_on else last)
+        left = self._where(lambda _, last: utc_day(last) >= day)
+        silences = (
+            silence for silence in left.silences if not silence[4] or utc_day(silence[1]) >= day
         )
-        return Thinned(
-            self.since,
-            silences,
-            tuple((start, end) for start, end in self.pauses if stays(end)),
-            tuple((time, by) for time, by in self.set_back if stays(time)),
-            tuple(filter(stays, self.left_open)),
-        )
+        return replace(left, silences=tuple(silences))
 
     def without(self, spans: Spans, topics: Collection[str] | None = None) -> Thinned:
         """Returns what is not in spans of log time; of some topics only their silences go."""
-
-        def stays(first: Ns, last: Ns) -> bool:
-            return not overlaps_any(spans, first, last)
-
-        silences = tuple(
+        left = self._where(lambda first, last: not overlaps_any(spans, first, last))
+        if topics is None:
+            return left
+        silences = (
             silence
             for silence in self.silences
-            if stays(*silence[1:3]) or (topics is not None and silence[0] not in topics)
+            if silence in left.silences or silence[0] not in topics
         )
-        if topics is not None:
-            return replace(self, silences=silences)
+        return replace(self, silences=tuple(silences))
+
+    def _where(self, stays: Callable[[Ns, Ns], bool]) -> Thinned:
+        """Returns what `stays` is true of, by its first and last time."""
         return Thinned(
             self.since,
-            silences,
-            tuple((start, end) for start, end in self.pauses if stays(start, end)),
-            tuple((time, by) for time, by in self.set_back if stays(time, time)),
+            tuple(silence for silence in self.silences if stays(*silence[1:3])),
+            tuple(pause for pause in self.pauses if stays(*pause)),
+            tuple(step for step in self.set_back if stays(step[0], step[0])),
             tuple(time for time in self.left_open if stays(time, time)),
         )
 
@@ -745,13 +735,13 @@ def read_withheld(bag_dir: Path) -> Withheld:
     return Withheld(_screen_state(bag_dir))
 
 
-def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
-    """Returns the excluded spans that overlap a window of log time."""
+def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> Spans:
+    """Returns the excluded spans that overlap a window of log time, in no order."""
     state = read_withheld(bag_dir).state
     if state is None:
         return []
-    spans = [*starmap(Excluded, state.earlier), *state.excluded]
-    return [span for span in spans if span.start < stop and start < span.stop]
+    spans = [*state.earlier, *(excluded.span for excluded in state.excluded)]
+    return [span for span in spans if span[0] < stop and start < span[1]]
 
 
 # triggers.json

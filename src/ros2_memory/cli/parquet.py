@@ -23,7 +23,7 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import recorded_as
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S
@@ -144,7 +144,7 @@ class Dataset:
         """Returns a recording's path in the bag directory, without the folder of a saved moment."""
         if recording == self.bag_dir:
             return recording.name
-        recorded = HardLinks(self.bag_dir).recorded_as(str(recording))
+        recorded = recorded_as(self.bag_dir, str(recording))
         return recorded.removeprefix(f"{self.bag_dir}/")
 
     def _partitions_folder(self) -> Path:

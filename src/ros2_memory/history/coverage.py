@@ -360,8 +360,7 @@ def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[Span]:
 def excluded_spans(bag_dir: Path, window: TimeWindow | None = None) -> Spans:
     """Returns the intervals (log time, half-open) that were excluded and overlap a window."""
     start, stop = (MIN_NS, MAX_NS) if window is None else (window.start, window.stop)
-    excluded = excluded_between(bag_dir, start, stop)
-    return united(stretch.span for stretch in excluded)
+    return united(excluded_between(bag_dir, start, stop))
 
 
 def unexcluded(view: View, gaps: Iterable[Span]) -> Iterator[Span]:

@@ -22,8 +22,7 @@ from weakref import proxy
 import numpy as np
 
 from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge, without_repeats
-from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned, recorded_as
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.transforms import STATICS, Pair, Statics, pairs_in, static_times
@@ -101,7 +100,6 @@ class Sessions:
     def __init__(self, view: View) -> None:
         # The view refers to its sessions: without a circle, its arrays are freed as the call ends.
         self._view: View = proxy(view)
-        self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
         self._recordings = view.timeline.memo.of(_RECORDINGS, dict)
@@ -115,7 +113,7 @@ class Sessions:
 
     def folder(self, recording: Path) -> str:
         """Returns the folder in which a recording was made; a saved moment keeps it elsewhere."""
-        return self._names.recorded_as(str(recording))
+        return recorded_as(self._view.bag_dir, str(recording))
 
     def recordings_of(self, session: Session, topics: tuple[str, ...]) -> Mapping[Path, Span]:
         """Returns the recordings of a session that hold some topics.

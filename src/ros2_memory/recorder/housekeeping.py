@@ -11,8 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import has_own_name
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import has_own_name, is_saved
 from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
@@ -140,7 +139,6 @@ class Housekeeping:
         self._moments = MomentKeeper(bag_dir, self.moments_bytes, self.clock, own, self.rule_bytes)
         self._triggers = None if self.watch is None else self.watch(self._moments)
         self._repairer = Repairer(reader, writer, bag_dir)
-        self._links = HardLinks(bag_dir)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * self.split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._out_of_reach = False
@@ -466,7 +464,7 @@ class Housekeeping:
                 continue
             if (path, status.st_size, status.st_mtime_ns) in self._tried:
                 continue
-            if path.suffix != _MCAP or path.parent in named or self._links.is_saved(str(path)):
+            if path.suffix != _MCAP or path.parent in named or is_saved(self.bag_dir, str(path)):
                 continue
             if self._may_repair(path, status):
                 yield path, status

@@ -32,8 +32,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_derived
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_derived, recorded_as
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
@@ -271,8 +270,7 @@ class Carrier:
 
     def _folder(self, recording: Path) -> str:
         """Returns the directory of a recording, relative to the bag directory."""
-        recorded = HardLinks(self.bag_dir).recorded_as(str(recording))
-        return os.path.relpath(recorded, self.bag_dir)
+        return os.path.relpath(recorded_as(self.bag_dir, str(recording)), self.bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """Yields the readable messages of the topics.

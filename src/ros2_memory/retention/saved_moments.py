@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER, is_derived
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER, is_derived, recorded_as
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
-    HardLinks,
     Outcome,
     RequestQueue,
     SavedMoment,
@@ -179,7 +178,6 @@ class MomentKeeper:
     def __post_init__(self) -> None:
         """Starts with nothing known."""
         self._queue = RequestQueue(self.bag_dir)
-        self._links = HardLinks(self.bag_dir)
         self._faulty: set[Path] = set()  # moments that cannot be read, or of which no link is made
         # Until the first call of `keep` shows that nothing is pending.
         self._waiting = True
@@ -263,7 +261,7 @@ class MomentKeeper:
         if moments.is_symlink():
             return
         for root, _ in directories.walk(moments):
-            recording = self._links.recorded_as(root)
+            recording = recorded_as(self.bag_dir, root)
             try:
                 if recording != root:
                     _link_sidecar(Path(recording), Path(root))
@@ -403,7 +401,7 @@ class MomentKeeper:
         links = _Links()
         by_folder: defaultdict[Path, list[_WantedLink]] = defaultdict(list)
         for bag in bags:
-            name = os.path.relpath(self._links.recorded_as(bag.file), self.bag_dir)
+            name = os.path.relpath(recorded_as(self.bag_dir, bag.file), self.bag_dir)
             target, file = folder / name, _file_of(bag.path)
             if file is None:
                 # `forget` has deleted it, in another process, since the index was made.

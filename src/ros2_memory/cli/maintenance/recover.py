@@ -12,8 +12,7 @@ from typing import Annotated, Final
 import typer
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE
-from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE, is_saved
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import AsJson
@@ -225,6 +224,5 @@ def _files_below(path: Path, clock: Clock) -> list[Path]:
     if tree.problem is not None:
         raise RecorderError(f"{path} cannot be listed: {tree.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
-    links = HardLinks(path)
-    bags = (Path(name) for name in tree.stamps if not links.is_saved(name))
+    bags = (Path(name) for name in tree.stamps if not is_saved(path, name))
     return sorted(bag for bag in bags if bag.suffix == _MCAP)
