@@ -36,6 +36,7 @@ from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import REPEATED_NS, IntArray, Mask
+from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -58,8 +59,6 @@ STRETCH_NS: Final[Ns] = 4 * 3600 * NS_PER_S
 """Fragments of so much of the clock are joined once."""
 _ATTEMPTS: Final = 5
 """How often a scan looks up what is stored, while that changes; then it reads the bags."""
-_MOST_DECODED: Final = 16
-"""Bags whose tables a scan keeps, to compare them with others."""
 _MOST_BYTES: Final = 64 << 20
 """Columns in memory at once; a bag with more has none, and its messages are read."""
 _TOO_LARGE: Final = "its messages are too large to hold their columns"
@@ -144,7 +143,8 @@ class Scan:
     check: Callable[[Ns], None] = lambda _: None
 
     def __post_init__(self) -> None:
-        self._decoded: dict[str, list[BagUnit]] = {}
+        # A bag is compared with all beside it: a long one is used again and again.
+        self._decoded = ByteLru[list[BagUnit]](_MOST_BYTES)
         # Rows that do not count, by the keys of their units: found when they are asked for.
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
@@ -412,32 +412,14 @@ class Scan:
 
     def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
         """Returns the tables of a bag, which is decoded unless it was lately."""
-        if bag.file not in self._decoded:
+        units = self._decoded.get(bag.file)
+        if units is None:
             hashed = bool(self.shared) or self.repeats_latched
             tables = _without_columns_if_large(self.decode(bag, self.topic, hashed))
             units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
-            self._decoded[bag.file] = units
-            self._drop_decoded(bag)
-        return self._decoded[bag.file]
-
-    def _drop_decoded(self, newest: BagFile) -> None:
-        """Drops decoded bags beyond the limits, those first whose rows are farthest from `newest`.
-
-        A long bag is needed for all beside it, so its age says little.
-        """
-
-        def distance(file: str) -> Ns:
-            units = self._decoded[file]
-            gaps = (max(unit.first - newest.end, newest.start - unit.last) for unit in units)
-            return min(gaps, default=MAX_NS)
-
-        while len(self._decoded) > 1:
-            units = [unit for of_bag in self._decoded.values() for unit in of_bag]
-            is_large = sum(unit.memory_bytes for unit in units) > _MOST_BYTES
-            if len(self._decoded) <= _MOST_DECODED and not is_large:
-                break
-            others = [file for file in self._decoded if file != newest.file]
-            del self._decoded[max(others, key=distance)]
+            size = sum(unit.table.memory_bytes for unit in units)
+            self._decoded.put(bag.file, units, size)
+        return units
 
     def _counting_rows(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None if all do."""

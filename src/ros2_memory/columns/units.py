@@ -111,11 +111,6 @@ class BagUnit(Unit):
         key = (bag.file, nth)
         super().__init__(key, table, first, last, columns.get, zeros[:1], lambda _: bag)
 
-    @cached_property
-    def memory_bytes(self) -> int:
-        """Its table's memory, computed once: that goes through all texts."""
-        return self.table.memory_bytes
-
 
 @dataclass(eq=False)
 class Rows:
