@@ -155,9 +155,8 @@ class Plan:
         steps: in the order of the payload.
         align: the alignment of the first field.
         least: the fewest bytes that a message takes.
-        unit: the greatest alignment of its fields, on which its layout depends.
-        ends: the position at which a message of fixed size ends if it begins at position 0, 1, ..
-            `unit` - 1; empty for a message of variable size.
+        size: how many bytes it takes from its first field on; None if that depends on the message,
+            or on where it begins, since another field has a greater alignment than the first.
         left_out: see `Table.left_out`.
         has_objects: whether it has strings or sequences of messages.
     """
@@ -165,8 +164,7 @@ class Plan:
     steps: tuple[Step, ...]
     align: int
     least: int
-    unit: int
-    ends: tuple[int, ...]
+    size: int | None
     left_out: dict[str, str]
     has_objects: bool
 
@@ -179,7 +177,7 @@ def plan_of(definition: Definition, most_numbers: int = MAX_NUMBERS) -> Plan:
         UnplannedError: it has more columns than `MAX_COLUMNS`, a field of a type that cannot become
             a column, or an array that is too long for any message.
     """
-    planner = _Planner(iter(range(MAX_COLUMNS)), most_numbers)
+    planner = _Planner(iter(range(MAX_COLUMNS)), most_numbers, first_align(definition))
     planner.add_message(definition, "", "")
     return planner.plan()
 
@@ -194,6 +192,8 @@ class _Planner:
     # Columns that may still be added; planners of elements take from the same iterator.
     budget: Iterator[int]
     most_numbers: int
+    # The alignment of the first field.
+    first: int
     steps: list[Step] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     unit: int = 8
@@ -202,27 +202,16 @@ class _Planner:
     align: int = 1
     size: int = 0
     run: list[tuple[Number | Time | Array, str, int]] = field(default_factory=list)
-    # Alignment and size of all fields; None once one of them has a variable size.
-    layout: list[tuple[int, int]] | None = field(default_factory=list)
-    # The alignment of the first field; 0 before there is one.
-    first: int = 0
     least: int = 0
+    # Bytes from the first field on; see `Plan.size`.
+    fixed: int | None = 0
 
     def plan(self) -> Plan:
         """Returns the plan of the fields that were added."""
         self._flush()
-        layout = self.layout or ()
-        unit = max((align for align, _ in layout), default=1)
-        ends = () if self.layout is None else tuple(self._end(start) for start in range(unit))
         has_objects = any(isinstance(step, Text | Sequence) for step in self.steps)
         steps, left_out = tuple(self.steps), self.left_out
-        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, has_objects)
-
-    def _end(self, at: int) -> int:
-        """Returns where a message of fixed size ends that begins at a position."""
-        for align, size in self.layout or ():
-            at += -at % align + size
-        return at
+        return Plan(steps, self.first, self.least, self.fixed, left_out, has_objects)
 
     def add_message(self, definition: Definition, path: str, attribute: str) -> None:
         """Adds the fields of a message at a path."""
@@ -296,7 +285,7 @@ class _Planner:
 
     def _elements(self, kind: str | Definition, length: int, path: str, attribute: str) -> None:
         first = first_align(kind)
-        planner = _Planner(self.budget, self.most_numbers, unit=first)
+        planner = _Planner(self.budget, self.most_numbers, first, unit=first)
         if isinstance(kind, Definition) and not is_time(kind):
             planner.add_message(kind, "", "")
         else:
@@ -310,9 +299,7 @@ class _Planner:
         if length == SEQUENCE:
             self._pass_variable(1, _LENGTH_BYTES)
             return
-        self.first = self.first or first
-        self.least += length * inner.least
-        self.layout, self.unit, self.rest = None, 1, 0
+        self._pass_variable(1, length * inner.least)
 
     def _fixed(self, entry: Number | Time | Array, dtype: str, align: int, size: int) -> None:
         """Adds a field of fixed size to the run."""
@@ -327,10 +314,9 @@ class _Planner:
         before = -self.rest % align
         self.size += before + size
         self.rest = (self.rest + before + size) % self.unit
-        self.first = self.first or align
         self.least += size
-        if self.layout is not None:
-            self.layout.append((align, size))
+        if self.fixed is not None:
+            self.fixed = None if align > self.first else self.fixed + -self.fixed % align + size
 
     def _flush(self) -> None:
         """Ends the run."""
@@ -351,7 +337,6 @@ class _Planner:
     def _begin_variable(self) -> tuple[int, int]:
         """Ends the run before a length; returns `align` and `skip` for the next run."""
         self._flush()
-        self.first = self.first or _LENGTH_BYTES
         return (_LENGTH_BYTES, 0) if self.unit < _LENGTH_BYTES else (1, -self.rest % _LENGTH_BYTES)
 
     def _pass_variable(self, unit: int, least: int) -> None:
@@ -361,7 +346,7 @@ class _Planner:
             unit: the position is a multiple of this.
             least: the fewest bytes that it takes.
         """
-        self.unit, self.rest, self.layout = unit, 0, None
+        self.unit, self.rest, self.fixed = unit, 0, None
         self.least += least
 
 

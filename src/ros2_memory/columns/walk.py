@@ -256,10 +256,10 @@ class _Walk:
         if (at + counts * max(step.plan.least, 1) > rows.sizes).any():
             raise NotWalkedError
         owners = np.repeat(np.arange(at.size), counts)
-        if step.plan.ends:
-            begins, end = _locate_fixed(step.plan, at, counts, owners)
-        else:
+        if step.plan.size is None:
             begins, end = self._locate_variable(step.plan, rows, at, counts)
+        else:
+            begins, end = _locate_fixed(step.plan.align, step.plan.size, at, counts)
         if (end > rows.sizes).any():
             raise NotWalkedError
         if level is not None:
@@ -289,24 +289,12 @@ class _Walk:
 
 
 def _locate_fixed(
-    plan: Plan, at: IntArray, counts: IntArray, owners: IntArray
+    align: int, size: int, at: IntArray, counts: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Returns where elements of a fixed layout begin, and where their sequences end.
-
-    From the second element on all are equally far apart, since the last field of the strictest
-    alignment puts whatever follows it at the same distance from a multiple.
-    """
-    unit, ends = plan.unit, np.array(plan.ends)
-    first = _aligned(at, plan.align)
-    rest = first % unit
-    second = _aligned(first - rest + ends[rest], plan.align)
-    rest = second % unit
-    distance = _aligned(ends[rest], plan.align) - rest
-    nth = places_within(counts)
-    begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * distance[owners])
-    last = np.where(counts > 1, second + (counts - 2) * distance, first)
-    end = last - last % unit + ends[last % unit]
-    return begins, np.where(counts > 0, end, at)
+    """Returns where elements of one size begin, and where their sequences end."""
+    first, distance = _aligned(at, align), size + -size % align
+    begins = np.repeat(first, counts) + places_within(counts) * distance
+    return begins, np.where(counts > 0, first + (counts - 1) * distance + size, at)
 
 
 def add_sequence(
