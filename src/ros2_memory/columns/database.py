@@ -12,7 +12,7 @@ import os
 import sqlite3
 import threading
 import time
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -21,7 +21,7 @@ from ros2_memory.core.errors import sqlite_code
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
 
@@ -218,7 +218,9 @@ class Database:
                 self.failures += 1
                 return unknown
             try:
-                answer = _read_in_transaction(opened.connection, ask)
+                # In one: packed bytes must be read with the codec that they were packed with.
+                with _transaction(opened.connection, "BEGIN"):
+                    answer = ask(opened.connection)
             # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
                 self.failures += 1
@@ -237,9 +239,10 @@ class Database:
                 if opened is None or self._close_if_lost(opened):
                     return False
                 try:
-                    answer = _write_in_transaction(
-                        opened.connection, write, is_probe=self.is_failing
-                    )
+                    with _transaction(opened.connection, "BEGIN IMMEDIATE"):
+                        answer = write(opened.connection)
+                        if self.is_failing:  # without a change nothing would touch the disk
+                            opened.connection.execute(f"PRAGMA user_version = {FORMAT:d}")
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or time.monotonic() >= give_up_s:
                         self._handle(error)
@@ -400,43 +403,17 @@ class Database:
             log.warning("database_not_set_aside", path=str(opened.path), reason=str(error))
 
 
-def _read_in_transaction(
-    connection: sqlite3.Connection, ask: Callable[[sqlite3.Connection], T]
-) -> T:
-    # One transaction: packed bytes must be read with the codec that they were packed with.
-    connection.execute("BEGIN")
+@contextmanager
+def _transaction(connection: sqlite3.Connection, begin: str) -> Iterator[None]:
+    """Runs a block in one transaction, which is rolled back if the block raises."""
+    connection.execute(begin)
     try:
-        return ask(connection)
-    finally:
-        if connection.in_transaction:  # not after an error that ended it
-            connection.execute("COMMIT")
-
-
-def _write_in_transaction(
-    connection: sqlite3.Connection,
-    write: Callable[[sqlite3.Connection], bool | None],
-    *,
-    is_probe: bool,
-) -> bool | None:
-    """Returns what `write` returns; rolls back if it raises.
-
-    Args:
-        connection: to write to.
-        write: writes.
-        is_probe: whether at least one page is written, to show that the disk works: a transaction
-            without a change touches no disk.
-    """
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        answer = write(connection)
-        if is_probe:
-            connection.execute(f"PRAGMA user_version = {FORMAT:d}")
+        yield
         connection.execute("COMMIT")
     except BaseException:
         with suppress(sqlite3.Error):
             connection.execute("ROLLBACK")
         raise
-    return answer
 
 
 def open_file(
@@ -643,14 +620,13 @@ def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
     """
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
-    connection.execute("BEGIN IMMEDIATE")
-    version = connection.execute("PRAGMA user_version").fetchone()[0]
-    declared = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-    if version == 0 and declared == 0:
-        for statement in STATEMENTS.split(";"):
-            connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {FORMAT:d}")
-    connection.execute("COMMIT")
+    with _transaction(connection, "BEGIN IMMEDIATE"):
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        declared = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        if version == 0 and declared == 0:
+            for statement in STATEMENTS.split(";"):
+                connection.execute(statement)
+            connection.execute(f"PRAGMA user_version = {FORMAT:d}")
     if declared and version != FORMAT:
         return f"it is of version {version}, and this program needs {FORMAT}"
     connection.execute(_FIRST_ROWS).fetchall()
