@@ -482,18 +482,21 @@ class FieldNumbers(NamedTuple):
     Attributes:
         rows: the row of each number, ascending; a row may have none, or several.
         numbers: finite; int64 if all are integers that fit, else float64.
-        error: the most by which one of them is off; 0 if they are exact. Angles of exact
-            quaternions may differ in their last digits.
-        errors: the most by which each of them is off; None if that is `error` for all.
+        errors: the most by which each of them is off. Angles of exact quaternions may differ in
+            their last digits.
         exactly: returns the exact numbers at some ascending positions; None if only the bag has
             them, and for a field with several numbers in a message.
     """
 
     rows: IntArray
     numbers: IntArray | Floats
-    error: float
-    errors: Floats | None = None
+    errors: Floats
     exactly: Callable[[IntArray], Floats] | None = None
+
+    @property
+    def are_exact(self) -> bool:
+        """Whether none of them is off."""
+        return not self.errors.any()
 
 
 def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:
@@ -512,7 +515,7 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     except UnknownShapeError:
         return None
     if not parts:
-        return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), 0.0)
+        return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
     return parts[0] if len(parts) == 1 else _joined(parts)
 
 
@@ -556,15 +559,9 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     rows = np.concatenate([part.rows for part in parts])
     joined = np.concatenate([part.numbers for part in parts])
+    errors = np.concatenate([part.errors for part in parts])
     order = np.argsort(rows, kind="stable")
-    error = max(part.error for part in parts)
-    if not error:
-        return FieldNumbers(rows[order], joined[order], error)
-    errors = [
-        np.full(part.rows.size, part.error) if part.errors is None else part.errors
-        for part in parts
-    ]
-    return FieldNumbers(rows[order], joined[order], error, np.concatenate(errors)[order])
+    return FieldNumbers(rows[order], joined[order], errors[order])
 
 
 def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node | None:
@@ -586,7 +583,7 @@ def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> list[Leaf]:
 
 
 def _numbers_of(values: Values, leaf: Leaf) -> FieldNumbers:
-    column, error, exactly = values.numbers(leaf)
+    column, errors, exactly = values.numbers(leaf)
     everything = np.arange(len(column))
     positions, rows = within_limits(values, leaf.level, everything, leaf.limits, surely=True)
     possible, _ = within_limits(values, leaf.level, everything, leaf.limits, surely=False)
@@ -603,7 +600,6 @@ def _numbers_of(values: Values, leaf: Leaf) -> FieldNumbers:
     return FieldNumbers(
         rows,
         column,
-        float(np.max(error, initial=0.0)),
-        error[positions] if isinstance(error, np.ndarray) else None,
+        errors[positions],
         None if exactly is None else lambda at: exactly(positions[at]),
     )

@@ -355,17 +355,17 @@ class _LeafTest(NamedTuple):
         return passes
 
     def _passing_numbers(self, numbers: LeafNumbers) -> TruthValues:
-        column, error, exactly = numbers
+        column, errors, exactly = numbers
         if column.dtype.kind == "b":
             if_false, if_true = self.passes(value=False), self.passes(value=True)
             return TruthValues.known(np.where(column, if_true, if_false))
         passed = self._passing_exactly(column)
-        if isinstance(error, float) and error == 0.0:
+        if not errors.any():
             return TruthValues.known(passed)
-        is_near = np.isinf(error) | np.zeros(len(column), np.bool_)
+        is_near: Mask = np.isinf(errors)
         for bound in self._bounds:
             with np.errstate(invalid="ignore"):  # infinity less infinity
-                is_near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
+                is_near |= (np.abs(column - as_float(bound)) <= errors) & (errors > 0.0)
         if exactly is None:
             return TruthValues(passed & ~is_near, passed | is_near)
         unsettled = np.flatnonzero(is_near)
@@ -519,15 +519,15 @@ class _PlaceTest(NamedTuple):
     def _near(self, columns: Sequence[LeafNumbers]) -> TruthValues:
         tolerance = self.test.tolerance_m
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
-        error = sum(column.error for column in columns)
+        errors = np.add.reduce([column.errors for column in columns])
         with np.errstate(all="ignore"):
             squares = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
             distance = np.sqrt(np.add.reduce(squares))
             is_near = distance <= tolerance
-            if not np.any(error):
+            if not errors.any():
                 return TruthValues.known(is_near)
             # The sum of the errors, not the root of their squares: that of 1e-200 is 0.
-            is_doubtful = np.abs(distance - tolerance) <= error + tolerance * _ROUNDING
+            is_doubtful = np.abs(distance - tolerance) <= errors + tolerance * _ROUNDING
             is_doubtful |= distance < _TINY_M
         return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
 

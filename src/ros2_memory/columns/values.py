@@ -139,13 +139,13 @@ class LeafNumbers(NamedTuple):
 
     Attributes:
         values: one for each row or element; angles as numpy computes them.
-        error: the most by which all of them, or each of them, is off; 0 if they are exact.
+        errors: the most by which each of them is off.
         exactly: returns the values at some positions as the conversions compute them; None if only
             the bag can say, or `values` are exact.
     """
 
     values: Numeric
-    error: float | Floats
+    errors: Floats
     exactly: Callable[[IntArray], Floats] | None = None
 
 
@@ -255,21 +255,19 @@ class Values:
             return self._angle(leaf, columns)
         column, error = columns[0], self.error(leaf)
         if leaf.conversion is Conversion.SECONDS:
-            return LeafNumbers(seconds(column), error / NS_PER_S)
-        is_real = leaf.kind is Kind.REAL and column.dtype.kind in "iu"
-        return LeafNumbers(column.astype(np.float64) if is_real else column, error)
+            column, error = seconds(column), error / NS_PER_S
+        elif leaf.kind is Kind.REAL and column.dtype.kind in "iu":
+            column = column.astype(np.float64)
+        return LeafNumbers(column, np.broadcast_to(error, len(column)))
 
     def floats(self, leaf: Leaf) -> tuple[Floats, float]:
         """Returns the numbers of a leaf, and the most by which any of them is off.
 
         Raises:
-            UnknownShapeError: the table has no column for them, or they are angles, which have
-                errors of their own.
+            UnknownShapeError: the table has no column for them.
         """
-        numbers, error, _ = self.numbers(leaf)
-        if not isinstance(error, float):
-            raise UnknownShapeError("each angle has an error of its own")
-        return numbers.astype(np.float64, copy=False), error
+        numbers, errors, _ = self.numbers(leaf)
+        return numbers.astype(np.float64, copy=False), float(errors.max(initial=0.0))
 
     def holds_all(self, leaf: Leaf) -> bool:
         """Returns whether each array that a leaf is an element of surely has a column."""

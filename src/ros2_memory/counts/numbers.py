@@ -409,7 +409,7 @@ class PieceNumbers:
         for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
             field_numbers, candidates = self._numbers(rows, field), np.arange(len(rows))
             if field_numbers is not None:
-                if not field_numbers.error or field_numbers.exactly is not None:
+                if field_numbers.are_exact or field_numbers.exactly is not None:
                     least = min(least, _exact_least(rows, field_numbers, sign))
                     continue
                 lows, _ = _bounds(field_numbers, sign)
@@ -423,11 +423,11 @@ class PieceNumbers:
 
 def _numbers_at(field_numbers: FieldNumbers, positions: IntArray) -> FieldNumbers:
     """Returns the numbers at ascending positions."""
-    errors, exactly = field_numbers.errors, field_numbers.exactly
+    exactly = field_numbers.exactly
     return field_numbers._replace(
         rows=field_numbers.rows[positions],
         numbers=field_numbers.numbers[positions],
-        errors=None if errors is None else errors[positions],
+        errors=field_numbers.errors[positions],
         exactly=None if exactly is None else lambda among: exactly(positions[among]),
     )
 
@@ -437,13 +437,12 @@ def _bounds(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns a lower and an upper bound on each number times the sign."""
     signed = sign * field_numbers.numbers.astype(np.float64)
-    errors = field_numbers.error if field_numbers.errors is None else field_numbers.errors
-    return signed - errors, signed + errors
+    return signed - field_numbers.errors, signed + field_numbers.errors
 
 
 def _column_extreme(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
     """Returns the extreme, as closely as the column decides it."""
-    if not field_numbers.error or field_numbers.exactly is not None:
+    if field_numbers.are_exact or field_numbers.exactly is not None:
         return _exact_least(rows, field_numbers, sign)
     lows, highs = _bounds(field_numbers, sign)
     low, high = float(lows.min()), float(highs.min())
@@ -473,7 +472,7 @@ def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
     values = np.array([number for sample in samples for number in sample])
     if values.dtype.kind not in "iu":
         values = values.astype(np.float64)
-    return FieldNumbers(range_numbers([*map(len, samples)]), values, 0.0)
+    return FieldNumbers(range_numbers([*map(len, samples)]), values, np.zeros(values.size))
 
 
 def numbers_in(value: JsonValue) -> Iterator[float]:
@@ -493,7 +492,7 @@ def _exact_least(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
     positions, values = np.arange(field_numbers.rows.size), field_numbers.numbers
     if not positions.size:
         return _NO_NUMBER
-    if field_numbers.error and field_numbers.exactly is not None:
+    if field_numbers.exactly is not None and not field_numbers.are_exact:
         lows, highs = _bounds(field_numbers, sign)
         positions = np.flatnonzero(lows <= highs.min())
         values = field_numbers.exactly(positions)
