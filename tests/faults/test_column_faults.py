@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.columns import database
-from ros2_memory.columns.writing import LongBag
+from ros2_memory.columns.writing import Writing
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts
@@ -169,13 +169,13 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
     assert asking.stored() == set()
     found: list[set[str]] = []
 
-    def end(self: LongBag, connection: sqlite3.Connection) -> bool:
+    def end(self: Writing, connection: sqlite3.Connection) -> bool:
         found.append(asking.stored())
         return whole(self, connection)
 
     with pytest.MonkeyPatch.context() as patch:
-        whole = LongBag.end
-        patch.setattr(LongBag, "end", end)
+        whole = Writing.end
+        patch.setattr(Writing, "end", end)
         decode_in_groups(patch)
         assert filling.fill_alone() == 1
     assert found == [set()]

@@ -286,13 +286,14 @@ class Filling:
         try:
             if self._renew(bag):
                 return True
-            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._may_be_stored, bag))
+            is_current = partial(self._may_be_stored, bag)
+            to_store = ReadBag(self._key(bag), bag, hashed, is_current, len(pending))
             # A latched message may come again later, in another recording.
             groups = undecoded(
                 self._reader,
                 bag.path,
                 hashed=lambda channel: hashed or channel.latched,
-                number=len(pending),
+                number=to_store.number,
             )
             first_groups = [*islice(groups, 2)]
             if len(first_groups) > 1 or bag.end - bag.start > LONG_NS:

@@ -31,13 +31,13 @@ from ros2_memory.columns.pack import Packed
 from ros2_memory.columns.stored import Layout, Topic
 from ros2_memory.columns.writing import (
     BELOW,
+    KEY,
     UNUSED_SUMMARIES,
     Level,
-    LongBag,
     ReadBag,
+    Writing,
     bytes_of_topics,
     delete_bags,
-    insert_bags,
     thin_parts,
     zone_of,
 )
@@ -100,7 +100,6 @@ def relative(path: str, bag_dir: str) -> str:
     return inner if inner.isascii() else inner.encode("utf-8", "backslashreplace").decode()
 
 
-_KEY: Final = ", ".join(BagKey._fields)
 _CODE: Final = "2 * id + (hashed > 0)"
 """A stored bag as one number, since the bags of a week are read; -1 stands for one not stored."""
 
@@ -278,7 +277,7 @@ class ColumnStore(Database):
 
     def _codes_of(self, keys: Sequence[Key]) -> dict[Key, int]:
         """Returns the codes of the bags that are stored; of others too if many are asked for."""
-        query = f"SELECT {_CODE}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
+        query = f"SELECT {_CODE}, {KEY} FROM bag WHERE definitions IN ('', ?)"
         given = [self._definitions]
         if len(keys) <= _FEW:
             query += " AND path IN (SELECT value FROM json_each(?))"
@@ -316,7 +315,7 @@ class ColumnStore(Database):
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
-        query = f"SELECT {_KEY} FROM bag WHERE first_ns < ?"
+        query = f"SELECT {KEY} FROM bag WHERE first_ns < ?"
         return self._select(lambda rows: [*map(BagKey._make, rows)], [], query, before)
 
     def paths(self) -> list[str]:
@@ -511,37 +510,20 @@ class ColumnStore(Database):
     def put(self, bags: Sequence[ReadBag], tables: Sequence[Table], level: Level) -> Written:
         """Stores bags of one recording in common parts, which replace their old ones.
 
-        A bag that has parts of this level already stays as it is: another program has stored it. A
-        bag that has changed meanwhile is left out.
-
         Args:
-            bags: by their numbers in the tables.
+            bags: the bags; see `Writing`.
             tables: all of their messages.
             level: of the parts.
         """
-        written = Written(0, ())
+        writing = Writing(bags, self._definitions, level)
 
-        def write(connection: sqlite3.Connection) -> None:
-            nonlocal written
-            rows = connection.execute(
-                f"SELECT {_KEY}, hashed FROM bag"
-                " WHERE definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
-                f" AND id NOT IN ({BELOW})",
-                (self._definitions, json.dumps([bag.key.path for bag in bags]), level),
-            )
-            is_hashed = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            new: dict[int, ReadBag] = {}
-            stored = 0
-            for number, bag in enumerate(bags):
-                if bag.key in is_hashed and (is_hashed[bag.key] or not bag.hashed):
-                    stored += 1
-                elif bag.is_current():
-                    new[number] = bag
-            delete_bags(connection, [bag.key.path for bag in new.values()])
-            ids = insert_bags(connection, new, tables, self._definitions, level)
-            written = Written(stored + len(new), [self.offset + part for part in ids])
+        def write(connection: sqlite3.Connection) -> bool:
+            writing.begin(connection)
+            return writing.add(connection, tables) and writing.end(connection)
 
-        return written if self.write(write) else Written(0, ())
+        if not self.write(write):
+            return Written(0, ())
+        return Written(writing.stored, [self.offset + part for part in writing.parts])
 
     def renew(self, key: BagKey, bag: BagFile) -> bool:
         """Gives a stored bag the mtime of its new sidecar; returns whether it did.
@@ -577,7 +559,7 @@ class ColumnStore(Database):
             groups: all of its messages; errors of the iterator are raised here.
             budget: how many bytes the parts may take.
         """
-        long = LongBag(to_store, self._definitions, budget)
+        long = Writing([to_store], self._definitions, Level.HOUR, budget)
         if not self.write(long.begin):
             return False
         is_whole = False

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -57,6 +57,8 @@ class Level(IntEnum):
 
 _MOST_ROWS: Final = 24_576
 """Of a part, about: a question about one message unpacks whole columns."""
+KEY: Final = "path, size, mtime_ns, sidecar_ns, first_ns, last_ns"
+"""The columns that identify a bag, in the order of a `BagKey`."""
 BELOW: Final = "SELECT value FROM part, json_each(part.bags) WHERE level < ?"
 """Selects the bags that have parts below a level."""
 _MOST_INTEGER: Final = 2**63 - 1
@@ -140,83 +142,121 @@ class ReadBag(NamedTuple):
         bag: the bag, for its times.
         hashed: whether its tables have the hashes of all payloads.
         is_current: returns whether the bag may still be stored; called inside the transaction.
+        number: of the bag in its tables.
     """
 
     key: BagKey
     bag: BagFile
     hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
+    number: int = 0
 
 
-class LongBag:
-    """A bag that is written in several transactions.
+@dataclass
+class Writing:
+    """Bags of one recording that are written in common parts, by one transaction or by several.
 
     `begin`, `add` and `end` return whether writing may go on: False if the file was replaced, or
-    the bag was deleted or has changed.
+    a bag was deleted or has changed.
 
-    Args:
-        to_store: the bag.
+    Attributes:
+        bags: the bags.
         definitions: as `ColumnStore` has them.
-        budget: how many bytes its parts may take.
+        level: of the parts.
+        budget: how many bytes the parts may take; None for any number. With a budget, each part has
+            an hour.
+        stored: how many of the bags are stored.
+        parts: the ids of their new parts.
     """
 
-    def __init__(self, to_store: ReadBag, definitions: str, budget: int) -> None:
-        self._bag = to_store
-        self._definitions = definitions
-        self._share = budget / max(_messages_of(to_store.bag), 1)
-        self._lacks_definitions = False
-        self._number = 0
-        self._connection: sqlite3.Connection | None = None
+    bags: Sequence[ReadBag]
+    definitions: str
+    level: Level
+    budget: int | None = None
+    stored: int = 0
+    parts: list[int] = field(default_factory=list)
+    _new: dict[int, ReadBag] = field(default_factory=dict)
+    _lacking: set[int] = field(default_factory=set)
+    _connection: sqlite3.Connection | None = None
 
     def begin(self, connection: sqlite3.Connection) -> bool:
-        """Inserts the bag in place of one with its path; a size of -1 marks it as unfinished."""
-        if not self._bag.is_current():
-            return False
-        key = self._bag.key
-        self._connection = connection
-        delete_bags(connection, [key.path])
-        self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
+        """Inserts the bags in place of those with their paths, as unfinished: with the size -1.
+
+        A bag that has parts of this level already stays as it is: another program has stored it. A
+        bag that has changed meanwhile is left out.
+        """
+        rows = connection.execute(
+            f"SELECT {KEY}, hashed FROM bag"
+            " WHERE definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
+            f" AND id NOT IN ({BELOW})",
+            (self.definitions, json.dumps([bag.key.path for bag in self.bags]), self.level),
+        )
+        is_hashed = {tuple(key): bool(hashed) for *key, hashed in rows}
+        new: list[ReadBag] = []
+        self.stored = 0
+        for bag in self.bags:
+            if bag.key in is_hashed and (is_hashed[bag.key] or not bag.hashed):
+                self.stored += 1
+            elif bag.is_current():
+                new.append(bag)
+        delete_bags(connection, [bag.key.path for bag in new])
+        self._connection, self.parts = connection, []
+        self._new = {_insert_bag(connection, bag): bag for bag in new}
         return True
 
     def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> bool:
-        """Inserts some of its messages, as parts of an hour each."""
+        """Inserts some of their messages, in parts for each topic.
+
+        Rows of bags that are stored, or that were left out, are left out.
+        """
         if not self._may_go_on(connection):
             return False
-        self._lacks_definitions |= any(map(lacks_definitions, tables))
+        ids = np.zeros(max(bag.number for bag in self.bags) + 1, np.int64)
+        ids[[bag.number for bag in self._new.values()]] = [*self._new]
         parts: list[int] = []
-        for table in filter(len, tables):
-            topic = topic_of(connection, table)
-            for hour in _split_by_hour(table):
-                for rows in _split_by_size(hour):
-                    part = pack_rows(rows, np.full(len(rows), self._number, np.int64))
-                    parts.append(_insert_part(connection, topic, part, Level.HOUR))
-        share = round(self._share * sum(map(len, tables)))
-        thin_parts(connection, parts, bytes_of_topics(connection), share)
+        for table in tables:
+            if "" in table.left_out:  # it may have columns with other definitions
+                self._lacking.update(np.unique(table.bag_numbers).tolist())
+            is_new = ids[table.bag_numbers] > 0
+            if is_new.any():
+                topic = _topic_of(connection, table)
+                rows = table if is_new.all() else table.rows(np.flatnonzero(is_new))
+                for piece in _pieces_of(rows, by_hour=self.budget is not None):
+                    part = pack_rows(piece, ids[piece.bag_numbers])
+                    parts.append(_insert_part(connection, topic, part, self.level))
+        if self.budget is not None:
+            messages = sum(_messages_of(bag.bag) for bag in self.bags)
+            share = round(self.budget / max(messages, 1) * sum(map(len, tables)))
+            thin_parts(connection, parts, bytes_of_topics(connection), share)
+        self.parts += parts
         return True
 
     def end(self, connection: sqlite3.Connection) -> bool:
-        """Gives the bag its size: now it is stored."""
+        """Gives the bags their sizes: now they are stored."""
         if not self._may_go_on(connection):
             return False
-        definitions = self._definitions if self._lacks_definitions else ""
-        connection.execute(
-            "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
-            (self._bag.key.size, definitions, self._number),
-        )
+        for number, bag in self._new.items():
+            definitions = self.definitions if bag.number in self._lacking else ""
+            connection.execute(
+                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
+                (bag.key.size, definitions, number),
+            )
+        self.stored += len(self._new)
         return True
 
     def delete_unfinished(self, connection: sqlite3.Connection) -> None:
         """Deletes the parts that were written."""
-        if self._exists(connection):
-            delete_bags(connection, [self._bag.key.path])
+        if self._exist(connection):
+            delete_bags(connection, [bag.key.path for bag in self._new.values()])
 
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
-        return self._exists(connection) and self._bag.is_current()
+        return self._exist(connection) and all(bag.is_current() for bag in self._new.values())
 
-    def _exists(self, connection: sqlite3.Connection) -> bool:
-        # Meanwhile the file may have been lost, or another program may have deleted the bag.
-        row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
-        return connection is self._connection and row is not None
+    def _exist(self, connection: sqlite3.Connection) -> bool:
+        # Meanwhile the file may have been lost, or another program may have deleted a bag.
+        query = "SELECT count(*) FROM bag WHERE id IN (SELECT value FROM json_each(?))"
+        [found] = connection.execute(query, (json.dumps([*self._new]),)).fetchone()
+        return connection is self._connection and found == len(self._new)
 
 
 def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:
@@ -294,16 +334,16 @@ def _note_deletion(connection: sqlite3.Connection) -> None:
     connection.execute("INSERT INTO deletion DEFAULT VALUES")
 
 
-def _split_by_hour(table: Table) -> Iterator[Table]:
-    begins = run_starts(table.log_times // PART_NS)
-    for rows in np.split(np.arange(len(table)), begins[1:]):
-        yield table.rows(rows)
+def _pieces_of(table: Table, *, by_hour: bool) -> Iterator[Table]:
+    """Yields a table in pieces of about `_MOST_ROWS`, and of one hour each if `by_hour`.
 
-
-def _split_by_size(table: Table) -> Iterator[Table]:
-    """Yields a table in pieces of about `_MOST_ROWS`; rows of one log time stay together."""
+    Rows of one log time stay together.
+    """
     times = table.log_times
-    edges = np.unique(np.searchsorted(times, times[_MOST_ROWS::_MOST_ROWS]))
+    edges = np.searchsorted(times, times[_MOST_ROWS::_MOST_ROWS])
+    if by_hour:
+        edges = np.append(edges, run_starts(times // PART_NS))
+    edges = np.unique(edges)
     if not edges.any():
         yield table
         return
@@ -311,64 +351,24 @@ def _split_by_size(table: Table) -> Iterator[Table]:
         yield table.rows(rows)
 
 
-def lacks_definitions(table: Table) -> bool:
-    """Returns whether a table has no columns; it may have some with other definitions."""
-    return "" in table.left_out
-
-
 def _messages_of(bag: BagFile) -> int:
     return sum(topic.count for topic in bag.summary.topics)
 
 
-def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
-    """Inserts a bag; returns its id."""
-    key, bag, hashed, _ = to_store
+def _insert_bag(connection: sqlite3.Connection, to_store: ReadBag) -> int:
+    """Inserts a bag as an unfinished one; returns its id."""
+    bag = to_store.bag
     summary = _find_or_insert(connection, "summary", topics=bag.summary.schema.to_json())
     return _insert(
         connection,
         "bag",
-        **key._asdict(),
+        **to_store.key._replace(size=-1)._asdict(),
         messages=_messages_of(bag),
-        hashed=hashed,
-        definitions=definitions,
+        hashed=to_store.hashed,
+        definitions="",
         summary=summary,
         counts=bag.summary.data,
     )
-
-
-def insert_bags(
-    connection: sqlite3.Connection,
-    bags: Mapping[int, ReadBag],
-    tables: Sequence[Table],
-    definitions: str,
-    level: Level,
-) -> list[int]:
-    """Inserts bags of one recording, in parts for each topic; returns the ids of the parts.
-
-    Args:
-        connection: to the store.
-        bags: by their numbers in the tables.
-        tables: all messages of these bags, a table for each topic and layout. Rows of other bags
-            are left out.
-        definitions: as `ColumnStore` has them.
-        level: of the parts.
-    """
-    lacking: set[int] = set()
-    for table in filter(lacks_definitions, tables):
-        lacking.update(np.unique(table.bag_numbers).tolist())
-    ids = np.zeros(max(bags, default=0) + 1, np.int64)
-    for number, bag in bags.items():
-        ids[number] = insert_bag(connection, bag, definitions if number in lacking else "")
-    parts: list[int] = []
-    for table in tables:
-        is_stored = np.isin(table.bag_numbers, [*bags])
-        if is_stored.any():
-            topic = topic_of(connection, table)
-            rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
-            for piece in _split_by_size(rows):
-                part = pack_rows(piece, ids[piece.bag_numbers])
-                parts.append(_insert_part(connection, topic, part, level))
-    return parts
 
 
 def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, level: Level) -> int:
@@ -419,7 +419,7 @@ def zone_of(
     return Zone(least, greatest, nulls, words)
 
 
-def topic_of(connection: sqlite3.Connection, table: Table) -> int:
+def _topic_of(connection: sqlite3.Connection, table: Table) -> int:
     """Returns the id of a table's topic, which is inserted if it is new."""
     channel, schema = table.channel, table.channel.schema
     definition = _find_or_insert(
