@@ -42,6 +42,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
+from ros2_memory.bag_dir.layout import bags_in
 from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
@@ -98,55 +99,6 @@ def announcing_sidecar(old: Handover, new_name: str | None) -> Handover:
     None withdraws the name: the new recording did not take over.
     """
     return replace(old, next=new_name, counts_until=None, end=None)
-
-
-def complete_sidecars(
-    old: Handover,
-    old_name: str,
-    new_name: str,
-    *,
-    began: Ns,
-    both: Ns,
-    ended: Ns,
-    old_files: Collection[str],
-    new_files: Collection[str],
-    simulated: bool,
-    clock: CutClock,
-) -> tuple[Handover, Handover]:
-    """Returns the sidecars of the old and the new recording after a complete handover.
-
-    The cut lies in the middle of `both` and `ended`. Write the new sidecar first.
-
-    Args:
-        old: the present sidecar of the old recording.
-        old_name: the name of the old recording.
-        new_name: the name of the new recording.
-        began: when the new recorder was started (wall time).
-        both: since when both recorders received messages.
-        ended: until when both recorders received messages.
-        old_files: the bag files of the old recording that were open during the handover.
-        new_files: the bag files of the new recording so far.
-        simulated: whether log times come from a simulated clock.
-        clock: whether publish times differ from log times.
-    """
-    cut = (both + ended) // 2
-    begin = Overlap(began, ended, tuple(sorted(new_files)))
-    end = Overlap(both, ended + LATE_MESSAGES_NS, tuple(sorted(old_files)))
-    if simulated:
-        begin, end = Overlap(None, None, begin.files), Overlap(None, None, end.files)
-    notes = _notes_on(clock)
-    all_notes = tuple(dict.fromkeys((*old.notes, *notes)))
-    return (
-        replace(old, clock=clock, next=new_name, counts_until=cut, end=end, notes=all_notes),
-        Handover(
-            clock=clock,
-            previous=old_name,
-            counts_from=cut,
-            begin=begin,
-            notes=notes,
-            compared=False,
-        ),
-    )
 
 
 def _notes_on(clock: CutClock) -> tuple[str, ...]:
@@ -231,8 +183,8 @@ class HandoverTransfer:
     def complete(self, now: ClockReading) -> bool:
         """Writes the cut; returns False if both recorders do not receive messages yet.
 
-        No cut is written if a simulated clock stamps both times of a message: the old recording
-        counts up to its end.
+        The cut lies in the middle of the time in which they did. None is written if a simulated
+        clock stamps both times of a message: the old recording counts up to its end.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -244,19 +196,29 @@ class HandoverTransfer:
         clock = cut_clock(newest, self.orders.reader) if newest else CutClock.PUBLISH
         if self.orders.simulated and clock is CutClock.LOG:
             return True
-        old_sidecar, new_sidecar = complete_sidecars(
-            handover_to_change(old),
-            self.old.name,
-            self.new.name,
-            began=self.began.wall,
-            both=self._both_since.wall,
-            ended=now.wall,
-            old_files=self._old_files(),
-            new_files=self.new.splits.names(),
-            simulated=self.orders.simulated,
+        both, ended = self._both_since.wall, now.wall
+        cut, notes, before = (both + ended) // 2, _notes_on(clock), handover_to_change(old)
+        begin = Overlap(self.began.wall, ended, tuple(sorted(self.new.splits.names())))
+        end = Overlap(both, ended + LATE_MESSAGES_NS, tuple(sorted(self._old_files())))
+        if self.orders.simulated:
+            begin, end = Overlap(None, None, begin.files), Overlap(None, None, end.files)
+        after = Handover(
             clock=clock,
+            previous=self.old.name,
+            counts_from=cut,
+            begin=begin,
+            notes=notes,
+            compared=False,
         )
-        write_handovers({new: new_sidecar, old: old_sidecar})
+        before = replace(
+            before,
+            clock=clock,
+            next=self.new.name,
+            counts_until=cut,
+            end=end,
+            notes=tuple(dict.fromkeys((*before.notes, *notes))),
+        )
+        write_handovers({new: after, old: before})
         return True
 
     def add_late_splits(self) -> None:
@@ -388,7 +350,7 @@ def _with_begin(begun: Handover, new: Path, logged: Ns, reader: BagReader) -> Ha
     until = min(logged + JITTER_NS, first + LONGEST_NS)
     later = {name for name, bag in bags.items() if bag.start >= until}
     # A file that cannot be read yet is still being written.
-    names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
+    names = tuple(path.name for path in bags_in(new) if path.name not in later)
     clock = cut_clock(new / next(iter(bags)), reader) if bags else CutClock.PUBLISH
     return replace(
         begun,
@@ -443,27 +405,14 @@ def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
     return reader.records(bag, topics, TimeWindow.everything())
 
 
-class _Message(NamedTuple):
-    """The identity of a message in both recordings."""
+class _Copy(NamedTuple):
+    """A message in a file of a recording, and whether the cut counts it there."""
 
+    file: str
     topic: str
     message_id: str
-
-
-class _Copy(NamedTuple):
-    """A place of a message in a recording: its file, and whether the cut counts it there."""
-
-    file: str
     counts: bool
     has_publish_time: bool
-
-
-class _Correction(NamedTuple):
-    """A message in a file for which the cut is wrong, and whether the message counts there."""
-
-    file: str
-    message: _Message
-    counts: bool
 
 
 class _Side(NamedTuple):
@@ -474,6 +423,7 @@ class _Side(NamedTuple):
         bags: the bags that are not empty, by file name.
     """
 
+    reader: BagReader
     recording: Path
     cut: Handover
     bags: dict[str, BagSummary]
@@ -499,22 +449,24 @@ class _Side(NamedTuple):
                     yield first, last
 
     def copies(
-        self, window: TimeWindow, reader: BagReader, *, latched: bool
-    ) -> defaultdict[_Message, Counter[_Copy]]:
-        """Returns how often the recording holds each message of a window, by place."""
-        copies: defaultdict[_Message, Counter[_Copy]] = defaultdict(Counter)
+        self, window: TimeWindow, *, latched: bool
+    ) -> defaultdict[tuple[str, str], Counter[_Copy]]:
+        """Returns how often the recording holds each message of a window, by topic and id."""
+        copies: defaultdict[tuple[str, str], Counter[_Copy]] = defaultdict(Counter)
         for file, bag in self.bags.items():
             if not window.overlaps(bag.start, bag.end):
                 continue
             topics, rule = [topic.topic for topic in bag.topics], self.cut.rule(file)
-            for record in _readable_records(reader.records(self.recording / file, topics, window)):
+            records = self.reader.records(self.recording / file, topics, window)
+            for record in _readable_records(records):
                 is_late = record.log_time - record.publish_time > FRESH_NS
                 if record.channel.latched and (is_late or not latched):
                     continue
+                topic = record.channel.topic
                 identity = message_id(record.publish_time, record.payload)
                 counts = rule is None or rule.counts(record)
-                copy = _Copy(file, counts, _has_publish_time(record))
-                copies[_Message(record.channel.topic, identity)][copy] += 1
+                copy = _Copy(file, topic, identity, counts, _has_publish_time(record))
+                copies[topic, identity][copy] += 1
         return copies
 
 
@@ -536,14 +488,14 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     is_next = before.next == new.name
     old_cut = Handover(counts_until=before.counts_until, end=before.end) if is_next else Handover()
     new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
-    old_side = _Side(old, old_cut, readable_bags(old, reader, only_closed=old in written))
-    new_side = _Side(new, new_cut, readable_bags(new, reader, only_closed=new in written))
+    old_side = _Side(reader, old, old_cut, readable_bags(old, reader, only_closed=old in written))
+    new_side = _Side(reader, new, new_cut, readable_bags(new, reader, only_closed=new in written))
     ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
     if lasting.recording in written and (
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    in_old, in_new = _corrections(old_side, new_side, reader, latched=is_void)
+    in_old, in_new = _miscounted(old_side, new_side, latched=is_void)
     count = len(in_old) + len(in_new)
     if count > MOST_LISTED:
         # Without a cut all messages of both recordings count.
@@ -564,32 +516,25 @@ def _without_files(overlap: Overlap | None) -> Overlap | None:
     return None if overlap is None else replace(overlap, files=())
 
 
-def _corrections(
-    old: _Side, new: _Side, reader: BagReader, *, latched: bool
-) -> tuple[list[_Correction], list[_Correction]]:
+def _miscounted(old: _Side, new: _Side, *, latched: bool) -> tuple[list[_Copy], list[_Copy]]:
     """Returns the messages of the old and of the new recording that the cut gets wrong.
 
     `latched` includes latched messages. No cut applies to them, but a void recording hides them.
     """
+    of_old: list[_Copy] = []
+    of_new: list[_Copy] = []
     window = _compared_window(old, new)
     if window is None:
-        return [], []
-    of_old: list[_Correction] = []
-    of_new: list[_Correction] = []
-    copies_in_old = old.copies(window, reader, latched=latched)
-    copies_in_new = new.copies(window, reader, latched=latched)
+        return of_old, of_new
+    copies_in_old, copies_in_new = (side.copies(window, latched=latched) for side in (old, new))
     for message in copies_in_old.keys() | copies_in_new.keys():
         in_old, in_new = copies_in_old[message], copies_in_new[message]
         if not all(copy.has_publish_time for copy in (*in_old, *in_new)):
             continue  # the cut alone decides
         # Where both hold it as often, the cut decides.
         is_old = _weight(in_old) >= _weight(in_new)
-        of_old += [
-            _Correction(copy.file, message, is_old) for copy in in_old if copy.counts != is_old
-        ]
-        of_new += [
-            _Correction(copy.file, message, not is_old) for copy in in_new if copy.counts == is_old
-        ]
+        of_old += [copy for copy in in_old if copy.counts is not is_old]
+        of_new += [copy for copy in in_new if copy.counts is is_old]
     return of_old, of_new
 
 
@@ -612,27 +557,25 @@ def _weight(copies: Counter[_Copy]) -> tuple[int, int]:
     return copies.total(), counted
 
 
-def _with_listed(handover: Handover, corrections: Sequence[_Correction]) -> Handover:
+def _with_listed(handover: Handover, miscounted: Sequence[_Copy]) -> Handover:
     """Returns a sidecar that lists these messages as well."""
+    counted = [copy for copy in miscounted if copy.counts]
+    hidden = [copy for copy in miscounted if not copy.counts]
     return replace(
         handover,
-        also_counts=_merged(handover.also_counts, corrections, counts=True),
-        counts_elsewhere=_merged(handover.counts_elsewhere, corrections, counts=False),
+        also_counts=_merged(handover.also_counts, hidden),
+        counts_elsewhere=_merged(handover.counts_elsewhere, counted),
     )
 
 
-def _merged(
-    listed: MessageList, corrections: Sequence[_Correction], *, counts: bool
-) -> MessageList:
-    """Returns the list with those messages added that count, or those that do not, sorted."""
+def _merged(listed: MessageList, added: Sequence[_Copy]) -> MessageList:
+    """Returns the list with more messages, sorted."""
     messages: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
     for file, topics in listed.items():
         for topic, message_ids in topics.items():
             messages[file, topic].update(message_ids)
-    for correction in corrections:
-        if correction.counts is counts:
-            topic, identity = correction.message
-            messages[correction.file, topic].add(identity)
+    for copy in added:
+        messages[copy.file, copy.topic].add(copy.message_id)
     merged: MessageList = {}
     for file, topic in sorted(messages):
         merged.setdefault(file, {})[topic] = tuple(sorted(messages[file, topic]))
@@ -665,7 +608,7 @@ def readable_bags(
     """
     summaries: dict[str, BagSummary] = {}
     withheld = read_withheld(recording.parent)
-    for path in _bag_files(recording, reader):
+    for path in bags_in(recording):
         try:
             if only_closed and (
                 withheld.holds(recording.name, path.name)
@@ -680,7 +623,3 @@ def readable_bags(
         if not summary.empty:
             summaries[path.name] = summary
     return summaries
-
-
-def _bag_files(recording: Path, reader: BagReader) -> list[Path]:
-    return sorted(path for path in recording.iterdir() if reader.reads(path))

@@ -29,7 +29,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.handover import (
     announcing_sidecar,
-    complete_sidecars,
     pending_sidecar,
     settle_handover,
     void_sidecar,
@@ -160,25 +159,26 @@ def hand_over(
     began, both, ended = (T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 2))
     before, after = (bag_dir / name for name in names)
 
-    def files(folder: Path) -> list[str]:
+    def files(folder: Path) -> tuple[str, ...]:
         spans = {p.name: READER.summarize(p) for p in folder.glob("*.mcap")}
-        return [
+        return tuple(
             file
-            for file, each in spans.items()
+            for file, each in sorted(spans.items())
             if each.empty or (each.end >= both if folder == before else each.start <= ended)
-        ]
+        )
 
-    old, new = complete_sidecars(
-        read_handover(before).handover,
-        before.name,
-        after.name,
-        began=began,
-        both=both,
-        ended=ended,
-        old_files=files(before),
-        new_files=files(after),
-        simulated=False,
+    earlier, cut = read_handover(before).handover, both + S
+    notes = (LOG_CLOCK_NOTE,) if clock is CutClock.LOG else ()
+    begin = Overlap(began, ended, files(after))
+    end = Overlap(both, ended + 30 * S, files(before))
+    old = replace(earlier, clock=clock, next=after.name, counts_until=cut, end=end, notes=notes)
+    new = Handover(
         clock=clock,
+        previous=before.name,
+        counts_from=cut,
+        begin=begin,
+        notes=notes,
+        compared=False,
     )
     write_handovers({after: new, before: old})
 
