@@ -7,13 +7,14 @@ from it, `forget` rewrites it. It is never changed in place: a new file takes it
 
 from __future__ import annotations
 
+import heapq
 import json
 import re
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
-from itertools import chain, count
+from itertools import chain, count, groupby
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -568,24 +569,17 @@ class MemoryDays:
     def _merged_by_hour(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
         """Yields the messages of a day and `added` ones by hour and topic, each once.
 
+        The `added` ones are in order of log time.
         Similar messages lie together, and compress well.
         """
-        topics = [channel.topic for channel in self.reader.channels(path)] if path.exists() else []
-        hours: defaultdict[int, list[Record]] = defaultdict(list)
-        for record in added:
-            hours[record.log_time // NS_PER_HOUR].append(record)
-        if topics:
-            # Only hours with messages: if the clock was set, years may lie between two.
-            for batch in self.reader.batches(path, topics, _EVERYTHING, bare=topics):
-                for hour in np.unique(batch.log_times // NS_PER_HOUR).tolist():
-                    hours.setdefault(hour, [])
-        for hour in sorted(hours):
-            window = TimeWindow(hour * NS_PER_HOUR, (hour + 1) * NS_PER_HOUR)
-            records = hours[hour]
-            if topics:
-                records = [*self.reader.records(path, topics, window), *records]
+        before: Iterator[Record] = iter(())
+        if path.exists():
+            topics = [channel.topic for channel in self.reader.channels(path)]
+            before = self.reader.records(path, topics, _EVERYTHING)
+        records = heapq.merge(before, added, key=attrgetter("log_time"))
+        for _, of_hour in groupby(records, key=lambda record: record.log_time // NS_PER_HOUR):
             identities: set[tuple[str, Ns, Ns, bytes]] = set()
-            for record in sorted(records, key=attrgetter("channel.topic", "log_time")):
+            for record in sorted(of_hour, key=attrgetter("channel.topic", "log_time")):
                 channel, logged, published, payload = record
                 identity = (channel.topic, logged, published, payload)
                 if identity not in identities:
