@@ -222,11 +222,8 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        name = self.name_of(directory)
-        if name in self._current_rows():
-            with suppress(OSError):
-                return self.lists(name, identity_of(directory))
-        return False
+        self._current_rows()
+        return self.lists(self.name_of(directory), known_identity(str(directory)))
 
     def is_announced(self, directory: Path) -> bool:
         """Whether a recording of this name is listed, and not yet its directory.
@@ -488,15 +485,12 @@ class OwnRecordings:
                 if not exists or self._lines > self._max_lines:
                     self._rewrite(rows)
                 else:
-                    self._append_lines(rows)
+                    with locked(self._path) as descriptor:
+                        append_lines(descriptor, LIST.text(rows))
+                    self._add(rows)
                 self._unwritten.clear()
         except OSError as error:
             raise self._failure(error) from error
-
-    def _append_lines(self, rows: Sequence[ListRow]) -> None:
-        with locked(self._path) as descriptor:
-            append_lines(descriptor, LIST.text(rows))
-        self._add(rows)
 
     def _rewrite(self, rows: Iterable[ListRow]) -> None:
         """Replaces the list by one with these lines, and without recordings that are gone."""

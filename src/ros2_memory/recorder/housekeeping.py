@@ -227,19 +227,16 @@ class Housekeeping:
         self._moments.open()
         has_restarted = self._triggers is not None and bool(self._triggers.restarts)
         if has_restarted or self._moments.has_work():
-            with self._index.undisturbed() as snapshot:
-                if self._moments.has_work():
-                    self._moments.keep(snapshot)
-                if self._triggers is not None and has_restarted:
-                    self._triggers.look(snapshot)
+            self._save_moments(before_deletion=False)
 
-    def _save_moments_in_pass(self) -> None:
-        """Saves pending moments and those of all rules, before a pass may delete their bags."""
+    def _save_moments(self, *, before_deletion: bool) -> None:
+        """Saves pending moments; those of rules if bags may be deleted, or recording restarted."""
         with self._index.undisturbed() as snapshot:
             if self._moments.has_work():
                 self._moments.keep(snapshot)
-            self._moments.relink_sidecars()
-            if self._triggers is not None:
+            if before_deletion:
+                self._moments.relink_sidecars()
+            if self._triggers is not None and (before_deletion or self._triggers.restarts):
                 self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
@@ -327,7 +324,7 @@ class Housekeeping:
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
         try:
-            self._save_moments_in_pass()
+            self._save_moments(before_deletion=True)
         except (EpisodicError, OSError) as error:
             # Only reported: if it stopped the deletion, the disk would fill.
             _log.error("moments_not_minded", reason=str(error))

@@ -16,10 +16,10 @@ import time
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, replace
-from itertools import groupby
+from itertools import groupby, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
+from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
@@ -58,42 +58,6 @@ class TopicCut(NamedTuple):
 
     bag: BagFile
     topics: frozenset[str]
-
-
-def plan_cuts(
-    topic_ages: Sequence[TopicAge],
-    contents: DirContents,
-    limits: RetentionLimits,
-    snapshot: Snapshot,
-    static_topics: Collection[str],
-) -> list[TopicCut]:
-    """Returns which topics are too old in which bags, the oldest bag first.
-
-    A bag may have no message of them. Messages that count in another recording go, too, and the
-    index does not show those.
-    """
-    timeline = snapshot.timeline
-    not_saved = {
-        bag.path
-        for bag in contents.bags
-        if contents.saved.keys().isdisjoint(file.inode for file in bag.files)
-    }
-    going: defaultdict[str, set[str]] = defaultdict(set)
-    for topic_age in topic_ages:
-        topics = [
-            topic
-            for topic in match_topics(timeline.topics(), topic_age.topics)
-            if topic not in static_topics and not timeline.is_transient_state(topic)
-        ]
-        if topics:
-            aged = bags_older_than(contents, limits, topic_age.max_age_ns)
-            for path in not_saved & aged.by_clock(synchronised=contents.synchronised):
-                going[path].update(topics)
-    return [
-        TopicCut(bag, frozenset(going[bag.file]))
-        for bag in snapshot.bags
-        if bag.file in going and bag.path.suffix == ".mcap"
-    ]
 
 
 @dataclass(eq=False, repr=False)
@@ -137,7 +101,7 @@ class TopicCutter:
         Raises:
             OSError: the free space cannot be measured, or the receipts of `ship` not be read.
         """
-        cuts = plan_cuts(self.topic_ages, contents, limits, snapshot, self.static_topics)
+        cuts = self._plan(contents, limits, snapshot)
         done = self._done
         waiting = [cut for cut in cuts if done.get(cut.bag.file) != (cut.bag.mtime_ns, cut.topics)]
         self._done = {cut.bag.file: done[cut.bag.file] for cut in cuts if cut.bag.file in done}
@@ -145,27 +109,58 @@ class TopicCutter:
             return 0
         begun = time.perf_counter_ns()
         until_s = self.monotonic() + SLICE_S
-        receipts = read_receipts(self.bag_dir) if (self.bag_dir / SHIPPED_FILE).exists() else {}
+        receipts = read_receipts(self.bag_dir)
         gone = list[Counter[str]]()
+
+        def may_go_on(cut: TopicCut) -> bool:
+            free = self.measure_free(self.bag_dir)
+            return self.monotonic() < until_s and free - cut.bag.size >= limits.min_free_bytes
+
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            gone_of_recording = list[Counter[str]]()
-            for cut in of_recording:
-                free = self.measure_free(self.bag_dir)
-                if self.monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
-                    break
-                if gone_of_bag := self._cut_or_report(cut, receipts):
-                    gone_of_recording.append(gone_of_bag)
+            gone_by_bag = (
+                self._cut_or_report(cut, receipts) for cut in takewhile(may_go_on, of_recording)
+            )
+            gone_of_recording = [*filter(None, gone_by_bag)]
             # Before the next recording: a kill leaves one metadata.yaml behind its bags at most.
             if gone_of_recording and (reason := why_not_corrected(recording, self.reader)):
                 _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
             gone += gone_of_recording
-            if self.monotonic() >= until_s:
-                break
         if gone:
             messages = dict(sum(gone, Counter[str]()))
             ms = ms_since(begun)
             _log.info("topics_cut", bags=len(gone), messages=messages, duration_ms=ms)
         return len(gone)
+
+    def _plan(
+        self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot
+    ) -> list[TopicCut]:
+        """Returns which topics are too old in which bags, the oldest bag first.
+
+        A bag may have no message of them. Messages that count in another recording go, too, and the
+        index does not show those.
+        """
+        timeline = snapshot.timeline
+        not_saved = {
+            bag.path
+            for bag in contents.bags
+            if contents.saved.keys().isdisjoint(file.inode for file in bag.files)
+        }
+        going: defaultdict[str, set[str]] = defaultdict(set)
+        for topic_age in self.topic_ages:
+            topics = [
+                topic
+                for topic in match_topics(timeline.topics(), topic_age.topics)
+                if topic not in self.static_topics and not timeline.is_transient_state(topic)
+            ]
+            if topics:
+                aged = bags_older_than(contents, limits, topic_age.max_age_ns)
+                for path in not_saved & aged.by_clock(synchronised=contents.synchronised):
+                    going[path].update(topics)
+        return [
+            TopicCut(bag, frozenset(going[bag.file]))
+            for bag in snapshot.bags
+            if bag.file in going and bag.path.suffix == ".mcap"
+        ]
 
     def _may_begin(self, waiting: Sequence[TopicCut]) -> bool:
         """Whether bags wait, and the machine is quiet, or was busy for `PATIENCE_S`."""

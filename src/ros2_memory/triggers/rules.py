@@ -23,6 +23,7 @@ import hashlib
 import heapq
 import time
 from dataclasses import KW_ONLY, dataclass
+from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
@@ -317,7 +318,7 @@ class SplitSearch:
         """Starts with nothing known."""
         self._failing = FailingFiles(self.monotonic)
         self._rules = [rule for rule in self.rules if rule.kind != "recorder_restart"]
-        self._watching: dict[str, tuple[Rule, ...]] = {}
+        self._rules_of = cache(self._find_rules)
         self._tested: set[tuple[str, str]] = set()
 
     def search(
@@ -409,12 +410,8 @@ class SplitSearch:
                     record.problem = None
         return matches
 
-    def _rules_of(self, topic: str) -> tuple[Rule, ...]:
-        if topic not in self._watching:
-            self._watching[topic] = tuple(
-                rule for rule in self._rules if match_topics((topic,), rule.topic or "")
-            )
-        return self._watching[topic]
+    def _find_rules(self, topic: str) -> tuple[Rule, ...]:
+        return tuple(rule for rule in self._rules if match_topics((topic,), rule.topic or ""))
 
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.

@@ -367,9 +367,7 @@ class Screening:
     ) -> _ClosedFiles:
         """Returns the splits that no later message can affect, and that are not put off."""
         ends = {name: state.recordings[name].end or 0 for name in unreleased}
-        live_ends: dict[str, Ns | None] = {}
-        for name in live:
-            live_ends[name] = state.recordings[name].end if name in state.recordings else None
+        live_ends = {name: state.recordings.get(name, RecordingScreen()).end for name in live}
         until = horizons(ends, live_ends, self._split)
         return [
             (path, summary)

@@ -112,8 +112,7 @@ class Triggers:
         for name, rule in self._rules.items():
             self._check_topic(rule, state.rules[name])
             self._store_moments(name, state.rules[name], snapshot)
-            if rule.kind == "message":
-                _note_lasting_match(name, state.rules[name])
+            _note_lasting_match(name, state.rules[name])
         if deleted:
             sentence = (
                 f"{counted(deleted, 'bag')} that rules may have needed were deleted to make room "
