@@ -57,7 +57,7 @@ def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
     write_handover(new, Handover(state=Counting.PENDING, previous="rec"))
     with monkeypatch.context() as patched:
         patched.setattr("ros2_memory.storage.file_io.os.open", fails_to_open)
-        with pytest.raises(RecorderError, match="Input/output error"):
+        with pytest.raises(BagUnreachableError, match="Input/output error"):
             settle_handover(old, new, McapReader())
         recover_handovers(tmp_path, McapReader())
     assert read_handover(old).handover == begun

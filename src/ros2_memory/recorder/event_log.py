@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.recorder.process.output import Line, LineKind
 
@@ -79,10 +79,10 @@ class EventLog:
 
     @contextmanager
     def lasting_if_refused(self, event: str, subject: str, **values: object) -> Iterator[None]:
-        """Logs a `RecorderError` of the block with `lasting`. Without one the fault is over."""
+        """Logs an error of the block with `lasting`. Without one the fault is over."""
         try:
             yield
-        except RecorderError as error:
+        except (EpisodicError, OSError) as error:
             self.lasting(event, subject, str(error), **values)
         else:
             self.lasting(event, subject, None)

@@ -188,6 +188,7 @@ class HandoverTransfer:
 
         Raises:
             RecorderError: a sidecar cannot be written.
+            BagUnreachableError: the disk fails.
         """
         if self._both_since is None:
             return False
@@ -270,28 +271,24 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
         True if nothing is left to do; False while a file that may matter is being written.
 
     Raises:
-        RecorderError: the recordings cannot be read, or the sidecars cannot be written.
+        RecorderError: a sidecar cannot be read or written.
+        BagError: the disk cannot show the messages at present: they must not count as missing.
+        OSError: the disk fails.
     """
-    try:
-        if not is_folder(old):
-            if is_folder(new) and handover_to_change(new).hides_all:
-                write_handover(new, Handover())
-            return True
-        begun = handover_to_change(old)
-        if begun.next == new.name and begun.counts_until is None:
-            if old.name not in running:
-                _write_cut(old, new, reader)
-                _log.info("handover_settled", recording=old.name, next=new.name)
-            elif new.name in running:
-                return False
-            else:
-                give_up(old, new)
-        return not is_folder(new) or _compare(old, new, reader, running)
-    except OSError as error:
-        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
-    except BagUnreachableError as error:
-        # The disk cannot show the messages at present: they must not count as missing.
-        raise RecorderError(str(error)) from error
+    if not is_folder(old):
+        if is_folder(new) and handover_to_change(new).hides_all:
+            write_handover(new, Handover())
+        return True
+    begun = handover_to_change(old)
+    if begun.next == new.name and begun.counts_until is None:
+        if old.name not in running:
+            _write_cut(old, new, reader)
+            _log.info("handover_settled", recording=old.name, next=new.name)
+        elif new.name in running:
+            return False
+        else:
+            give_up(old, new)
+    return not is_folder(new) or _compare(old, new, reader, running)
 
 
 def give_up(old: Path, new: Path) -> None:
@@ -382,12 +379,12 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
     PUBLISH also for an empty or damaged file.
 
     Raises:
-        RecorderError: the disk fails.
+        BagUnreachableError: the disk fails.
     """
     try:
         records = list(islice(_unlatched_records(bag, reader), SAMPLE))
-    except BagUnreachableError as error:
-        raise RecorderError(str(error)) from error
+    except BagUnreachableError:
+        raise
     except BagError:
         return CutClock.PUBLISH
     if records and not any(map(_has_publish_time, records)):

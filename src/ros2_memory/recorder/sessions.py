@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, recording_name
 from ros2_memory.bag_dir.state_files import read_deleted
-from ros2_memory.core.errors import BagError, RecorderError
+from ros2_memory.core.errors import BagError, EpisodicError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Clock, Ns
 from ros2_memory.recorder.handover import (
@@ -728,5 +728,5 @@ class RecordingSessions:
         """Reports an error of the session's handover, and continues after the block."""
         try:
             yield
-        except (RecorderError, OSError) as error:
+        except (EpisodicError, OSError) as error:
             self.events.fail("rotation_failed", str(error), recording=session.name)

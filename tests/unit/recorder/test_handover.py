@@ -25,6 +25,8 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
+from ros2_memory.core.bag_summary import BagSummary
+from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.handover import (
@@ -408,6 +410,28 @@ def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path
         World(tmp_path).started(100)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
     assert read_handover(tmp_path / "c").handover.next is None
+
+
+def test_a_bag_that_goes_while_its_handover_is_settled_is_reported_and_recording_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(
+        cut_recording(tmp_path, "a", 0, 10, delay=5), cut_recording(tmp_path, "b", 7, 15, delay=9)
+    )
+    looks, summarize = Counter[str](), McapReader.summarize
+
+    def vanishing(reader: McapReader, path: Path) -> BagSummary:
+        looks[path.name] += 1
+        if path.name == "a_0.mcap" and looks[path.name] == 2:
+            raise BagVanishedError(str(path), "the file is not there any more")
+        return summarize(reader, path)
+
+    monkeypatch.setattr(McapReader, "summarize", vanishing)
+    with capture_logs() as logs:
+        World(tmp_path).started(100)
+    reported = [each["reason"] for each in logs if each["event"] == "handover_not_settled"]
+    assert reported == [f"{tmp_path / 'a' / 'a_0.mcap'}: the file is not there any more"]
+    assert read_handover(tmp_path / "a").handover.counts_until is not None
 
 
 def test_one_whose_predecessor_is_gone_counts_and_stays_as_it_is(tmp_path: Path) -> None:
