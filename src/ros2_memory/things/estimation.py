@@ -37,7 +37,7 @@ from ros2_memory.things.instances import (
     count_names,
 )
 from ros2_memory.things.labels import Labels, moves_by_itself
-from ros2_memory.things.places import GATE_MM, MIDDLE, places_of, stays_in, with_synonyms
+from ros2_memory.things.places import GATE_MM, MIDDLE, places_of, stays_in
 from ros2_memory.things.presence import Evidence, evidence_at, stays_at
 from ros2_memory.things.stays import (
     FEWEST,
@@ -49,6 +49,7 @@ from ros2_memory.things.stays import (
     placed_stays,
     remove_false_stays,
 )
+from ros2_memory.things.synonyms import with_synonyms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -9,11 +9,6 @@ the mean of some looks. It has three errors: the noise of each look; the error o
 all looks of a *visit* share; and a bias along the view of the detector. A regression of all visits
 on the side of the view and on a step says how large the step is, and how exactly that is known.
 
-Which labels a detector uses for one thing in turn (`with_synonyms`): "mug" and "coffee mug", at one
-place. They end in the same word, lie within the scatter of each other, alternate within a visit,
-and are not in one message there. Names that the owner declares apart stay apart, and one that is
-used in turn with both of them is joined with neither.
-
 When localisation was poor (`poorly_localised`): then a detection is not where it seems to be.
 Localisation is poor while the localiser's covariance is large, and for some seconds before the map
 jumps under odometry, which shows that it had been off.
@@ -22,29 +17,27 @@ jumps under odometry, which shows that it had been off.
 from __future__ import annotations
 
 import math
-from collections import defaultdict, deque
-from itertools import chain, combinations, pairwise, product
+from collections import deque
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
-from ros2_memory.analysis.sights import Beside, Fix, Look, Spot
+from ros2_memory.analysis.sights import Fix, Look, Spot
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
     distinct_rows,
-    numbered,
     places_among,
     range_numbers,
     run_starts,
     stable_order,
 )
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.labels import Labels, last_word, moves_by_itself, unspaced
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
@@ -409,131 +402,6 @@ def _before_and_after(
     old = until[..., visit] - until[..., first[thing]] + _normal_equations(here - begin, own)
     new = until[..., stop[thing]] - until[..., visit + 1] + _normal_equations(end - here, own)
     return old, new
-
-
-_FEWEST_TURNS: Final = 3
-"""A label that took fewer turns is a mistake."""
-_BESIDE_SHARE: Final = 0.02
-"""One message in fifty may have a thing twice."""
-_LEAST_SHARE: Final = 0.05
-"""A label that is given more rarely is a mistake."""
-_SAME_MM: Final = 100.0
-"""The means of two labels in a visit are at one place if they are this near to each other."""
-_SCATTERS: Final = 2.0
-"""Or if they are within two root mean square distances of the looks."""
-
-
-def with_synonyms(
-    sights: JoinedSights,
-    counts: Ints,
-    labels: Labels,
-    go_on: Callable[[], None],
-) -> list[str]:
-    """Returns the key of each label of the sights: one key for all names of one thing.
-
-    `counts` has how many detections of each spot count.
-    """
-    keys = [labels.key(label) for label in sights.labels]
-    distinct, key_of_label = numbered(keys)
-    number_of = {key: number for number, key in enumerate(distinct)}
-
-    def labels_of(key: str) -> Flags:
-        mask: Flags = key_of_label == number_of[key]
-        return mask
-
-    def are_two(one: str, other: str) -> bool:
-        go_on()
-        return labels.are_apart(one, other) or _are_beside(sights, labels_of(one), labels_of(other))
-
-    groups = {key: frozenset({key}) for key in keys}
-    placed = np.unique(sights.spots[counts > 0, Spot.LABEL])
-    for one, other in _pairs_of_a_kind({keys[label] for label in placed.tolist()}):
-        masks = labels_of(one), labels_of(other)
-        is_one = unspaced(one) == unspaced(other)
-        if not are_two(one, other) and (is_one or _alternate(sights, counts, *masks)):
-            group = groups[one] | groups[other]
-            groups |= dict.fromkeys(group, group)
-    names: dict[str, str] = {}
-    for group in {*groups.values()}:
-        # A name that is used for two things does not tell them apart.
-        if not any(are_two(one, other) for one, other in combinations(sorted(group), 2)):
-            names |= dict.fromkeys(group, min(group))
-    return [names.get(key, key) for key in keys]
-
-
-def _pairs_of_a_kind(keys: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yields the pairs of keys that may name the same thing, and no people or pets.
-
-    They end in the same word, or differ in spacing only ("fork lift", "forklift").
-    """
-    by_word: dict[str, set[str]] = defaultdict(set)
-    for key in keys:
-        if not moves_by_itself(key):
-            by_word[last_word(key)].add(key)
-            by_word[unspaced(key)].add(key)
-    of_a_kind = (combinations(sorted(keys_of_a_kind), 2) for keys_of_a_kind in by_word.values())
-    yield from sorted({*chain.from_iterable(of_a_kind)})
-
-
-def _are_beside(sights: JoinedSights, one: Flags, other: Flags) -> bool:
-    """Returns whether messages have two keys at one place, more often than by mistake.
-
-    Each mask selects the labels of one key.
-    """
-    label, beside = sights.spots[:, Spot.LABEL], sights.beside
-    spot, label_beside, n = (beside[:, name] for name in Beside)
-    is_both = one[label[spot]] & other[label_beside]
-    rarer = min(int(sights.spots[mask[label], Spot.N].sum()) for mask in (one, other))
-    return bool(n[is_both].sum() > _BESIDE_SHARE * rarer)
-
-
-def _alternate(sights: JoinedSights, counts: Ints, one: Flags, other: Flags) -> bool:
-    """Returns whether two keys take turns at some place, within the scatter of each other.
-
-    Each mask selects the labels of one key.
-    """
-    spots = sights.spots
-    of_both = np.flatnonzero((one | other)[spots[:, Spot.LABEL]] & (counts > 0))
-    epoch = sights.epochs[spots[of_both, Spot.SLICE]]
-    for number in np.unique(epoch).tolist():
-        rows = of_both[epoch == number]
-        names = (Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL)
-        x, y, slices, label = (spots[rows, name] for name in names)
-        place = places_of(x, y, counts[rows], slices)
-        for nth_place in range(int(place.max(initial=-1)) + 1):
-            here = place == nth_place
-            is_other = other[label[here]].astype(np.int64)
-            if not is_other.any() or is_other.all():
-                continue
-            rarer, total = _turns(spots[rows[here]], counts[rows[here]], is_other)
-            if rarer >= max(_FEWEST_TURNS, _LEAST_SHARE * total):
-                return True
-    return False
-
-
-def _turns(spots: Ints, n: Ints, is_other: Ints) -> tuple[int, int]:
-    """Returns how often the rarer of two labels was seen in visits with turns, and both together.
-
-    `spots` are at one place in order of time, with `n` detections each; `is_other` is 0 or 1.
-    """
-    visit = visits_of(spots[:, Spot.FIRST], spots[:, Spot.LAST])
-    cell, size = 2 * visit + is_other, 2 * int(visit[-1]) + 2
-    seen = np.bincount(cell, n, size)
-    means = [
-        (np.bincount(cell, n * spots[:, column], size) / np.maximum(seen, 1)).reshape(-1, 2)
-        for column in (Spot.X, Spot.Y)
-    ]
-    apart = np.hypot(*(mean[:, 1] - mean[:, 0] for mean in means))
-    squares = np.bincount(visit, n * spots[:, Spot.DEV] ** 2)
-    scatter = np.sqrt(squares / np.bincount(visit, n))
-    first, last = np.full(size, np.iinfo(np.int64).max), np.zeros(size, np.int64)
-    np.minimum.at(first, cell, spots[:, Spot.FIRST])
-    np.maximum.at(last, cell, spots[:, Spot.LAST])
-    begin, end = first.reshape(-1, 2), last.reshape(-1, 2)
-    in_turn = (begin[:, 0] < end[:, 1]) & (begin[:, 1] < end[:, 0])
-    in_turn &= apart <= np.maximum(_SAME_MM, _SCATTERS * scatter)
-    turns = seen.reshape(-1, 2)[in_turn].sum(axis=0)
-    return int(turns.min()), int(turns.sum())
 
 
 _POOR_MM: Final = 600

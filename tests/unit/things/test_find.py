@@ -25,8 +25,9 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
-from ros2_memory.things import known, unseen
+from ros2_memory.things import known, synonyms, unseen
 from ros2_memory.things.find import find_things
+from ros2_memory.things.places import places_of
 from tests.support.bags import Msg, detected, header, make, odom, text, tf, transform, write_splits
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -112,6 +113,20 @@ def test_a_question_for_many_labels_looks_through_all_spots_as_often_as_one_for_
         missed = [note for note in found["notes"] if "and not once in this window" in note]
         assert len(missed) == len(asked_for)
         assert looks.call_count == 2 * 2  # what has a place, and what has none
+
+
+def test_labels_of_one_kind_are_placed_together_however_many_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pair by pair, the hundred kinds of box of a warehouse took a minute."""
+    placing = Mock(wraps=places_of)
+    monkeypatch.setattr(synonyms, "places_of", placing)
+    for kinds in (3, 12):
+        placing.reset_mock()
+        boxes = [(f"kind {nth} box", 2.0, nth - 5.0) for nth in range(kinds)]
+        found = told_of(tmp_path / str(kinds), looked(0, 30, HERE, *boxes), limit=100)
+        assert found["total"] == kinds
+        assert placing.call_count == 1
 
 
 @pytest.mark.parametrize(("recalls", "map_off"), [(False, None), (True, 0.6)])
