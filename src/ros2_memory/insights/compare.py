@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from itertools import islice, zip_longest
+from itertools import chain, islice, zip_longest
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
@@ -91,6 +91,8 @@ _Kind: TypeAlias = Literal[
     "same",
 ]
 """The lists of `ComparedThings`, or "same"."""
+_Numbers: TypeAlias = defaultdict[tuple[str, str], float]
+"""Numbers above 0 by the name of what is counted, and by the topic that says so."""
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}
@@ -196,8 +198,8 @@ class _Side(NamedTuple):
         is_recorded: whether anything was recorded in it.
         placement: the frames of the robot's poses and of places; None without poses.
         way: the numbers of the path by the names in `_LEAST`; None for an unknown number.
-        errors: how often each error was reported, by its text and then by topic.
-        silences: for how many seconds each topic was silent while the robot was on; as `errors`.
+        errors: how often each error was reported.
+        silences: for how many seconds each topic was silent while the robot was on.
         length_s: how long the window is.
         recorded_s: how much of it was recorded.
     """
@@ -208,8 +210,8 @@ class _Side(NamedTuple):
     drive: Drive
     placement: MapPlacement | None
     way: Mapping[str, float | None]
-    errors: Mapping[str, Mapping[str, float]]
-    silences: Mapping[str, Mapping[str, float]]
+    errors: _Numbers
+    silences: _Numbers
     length_s: float
     recorded_s: float
 
@@ -604,40 +606,34 @@ def _minutes_of(
     return minutes
 
 
-def _error_counts(view: View, window: TimeWindow) -> Mapping[str, Mapping[str, float]]:
-    """Returns how often each error was reported, by its text and then by topic."""
-    counts: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+def _error_counts(view: View, window: TimeWindow) -> _Numbers:
+    """Returns how often each error was reported, by its text and its topic."""
+    counts: _Numbers = defaultdict(float)
     for topic, events in events_by_topic(view, window, has_errors).items():
         for error in () if events is None else events.errors:
-            counts[Quoted(error.text)][topic] += error.reports
+            counts[Quoted(error.text), topic] += error.reports
     return counts
 
 
-def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, Mapping[str, float]]:
-    """Returns how many seconds each topic was silent while the robot was on; as `_error_counts`."""
-    seconds: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+def _silent_seconds(view: View, window: TimeWindow) -> _Numbers:
+    """Returns how many seconds each topic was silent while the robot was on, as `_Numbers`."""
+    seconds: _Numbers = defaultdict(float)
     for silence in silences_in(view, window):
-        seconds[silence.topic][silence.topic] += unix_from_ns(silence.length)
+        seconds[silence.topic, silence.topic] += unix_from_ns(silence.length)
     return seconds
 
 
-def _in_both(
-    sides: tuple[_Side, _Side], *numbers: Mapping[str, Mapping[str, float]]
-) -> list[dict[str, float | None]]:
-    """Returns for each window the numbers by name, those of the other one's names as well.
-
-    `numbers` are those of each window, by name and then by topic.
-    """
+def _in_both(sides: tuple[_Side, _Side], *numbers: _Numbers) -> list[dict[str, float | None]]:
+    """Returns for each window its numbers by name, those of the other one's names as well."""
     topics: dict[str, set[str]] = defaultdict(set)
-    for by_name in numbers:
-        for name, by_topic in by_name.items():
-            topics[name].update(by_topic)
+    for name, topic in chain(*numbers):
+        topics[name].add(topic)
     return [
         {
-            name: sum(by_name[name].values()) if name in by_name else side.none_on(topics[name])
-            for name in topics
+            name: sum(of_side[name, topic] for topic in among) or side.none_on(among)
+            for name, among in topics.items()
         }
-        for side, by_name in zip(sides, numbers, strict=True)
+        for side, of_side in zip(sides, numbers, strict=True)
     ]
 
 

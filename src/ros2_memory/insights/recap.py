@@ -24,7 +24,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.spans import united as united_spans
 from ros2_memory.core.text import Quoted, counted, listed, repeating
-from ros2_memory.core.timebase import Ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     deleted_between,
@@ -98,6 +98,8 @@ _PLURALS: Final = {
 _KINDS: Final = tuple(_PLURALS)
 _OF_ROBOT: Final = frozenset({"error", "stop", "flip", "drop"})
 """The kinds of events that name the place where the robot was."""
+_OF_ANY_DAY: Final = _KINDS.index("stop")
+"""The kinds from this one on happen on any day."""
 
 
 def recap_or_before(
@@ -168,7 +170,9 @@ def recap(
     things = _things_in_view(
         view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
-    stops = _stops_inside(drive.stops, region_stays)
+    stops = drive.stops
+    if region_stays is not None:
+        stops = [stop for stop in stops if region_stays.overlaps(*stop.span)]
     goals = goals_in(view, window, events_of_topics)
     events = [
         *_stop_events(nsmallest(most_events, stops, key=lambda stop: -stop.length), places),
@@ -188,11 +192,13 @@ def recap(
     if with_changes:
         shown = _with_changes(changes_in(view, window, events_of_topics), shown)
     shown = [
-        replace(event, skipped=drive.elapsed.skipped_between(event.start, event.end or event.start))
+        replace(
+            event,
+            places=_place_names(event, places),
+            skipped=drive.elapsed.skipped_between(event.start, event.end or event.start),
+        )
         for event in shown
     ]
-    if places is not None:
-        shown = [_with_place_names(event, places) for event in shown]
     answer = Recap(
         start=start,
         end=end,
@@ -203,7 +209,7 @@ def recap(
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
         throughout=tuple(sorted(things.throughout)),
-        counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
+        counts=tuple((name, counts[kind]) for kind, name in _PLURALS.items() if counts[kind]),
         skipped=drive.elapsed.skipped_between(start, end),
     )
     if region_stays is None or region is None:
@@ -296,14 +302,14 @@ def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays
     )
 
 
-def _with_place_names(event: Event, places: RobotPlaces) -> Event:
-    """Returns an event with the names of the places where the robot was then."""
-    if event.kind not in _OF_ROBOT:
-        return event
+def _place_names(event: Event, places: RobotPlaces | None) -> tuple[str, ...]:
+    """Returns the names of the places where the robot was at an event, if its kind names them."""
+    if places is None or event.kind not in _OF_ROBOT:
+        return ()
     at = event.start
     if event.kind == "stop" and event.end is not None:
         at = places.standstill_time(event.start, event.end)
-    return replace(event, places=places.names_at(at))
+    return places.names_at(at)
 
 
 def events_by_topic(
@@ -330,19 +336,23 @@ def _reported_events(
         if topic_events is None:
             continue
         toggles = _toggles(view, topic, topic_events)
-        if toggles and is_latched(view, topic):  # a latched value holds through gaps
-            events += _flip_events(topic, toggles, breaks_of(view, topic))
-        elif toggles and view.timeline.is_on_events(topic):  # there are no messages between goals
-            heard = heard_times(view, [topic], window)
-            events += _flip_events(topic, toggles, [stop - 1 for _, stop in heard])
-        elif toggles:
-            unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
-            events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])
+        if toggles:
+            events += _flip_events(topic, toggles, _ends_of_holding(view, topic, window))
         errors = _errors_in_region(view, topic, topic_events, region_stays)
         events += [_error_event(error) for error in errors]
         events += _low_charge_events(view, topic, topic_events)
         note_limits(view, topic, topic_events)
     return events
+
+
+def _ends_of_holding(view: View, topic: str, window: TimeWindow) -> list[Ns]:
+    """Returns the moments, in order, after which a boolean of a topic is not known to hold."""
+    if is_latched(view, topic):
+        return breaks_of(view, topic)  # it holds through gaps
+    if view.timeline.is_on_events(topic):  # there are no messages between goals
+        return [stop - 1 for _, stop in heard_times(view, [topic], window)]
+    unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
+    return [begin for begin, _ in unrecorded]
 
 
 def _toggles(view: View, topic: str, events: TopicEvents) -> list[Change]:
@@ -448,15 +458,6 @@ def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
-def _stops_inside(
-    stops: Sequence[Standstill], region_stays: _RegionStays | None
-) -> Sequence[Standstill]:
-    """Returns the stops that overlap a stay in the region; all without a region."""
-    if region_stays is None:
-        return stops
-    return [stop for stop in stops if region_stays.overlaps(*stop.span)]
-
-
 def _stop_events(stops: Iterable[Standstill], places: RobotPlaces | None) -> Iterator[Event]:
     """Yields stops with the point where the robot stood, in the frame of places if it is known."""
     for start, end, box, goes_on in stops:
@@ -542,23 +543,17 @@ def _low_charge_events(view: View, topic: str, events: TopicEvents) -> Iterator[
     levels += [(change.time, change.value) for change in changes]
     begins = {state.at for state in charges}
     since, lowest = None, 0
-    for time, level in levels:
+    for time, level in [*levels, (MAX_NS, 0)]:
         if level > LOW_CHARGES.index(_LOW_CHARGE):
             since, lowest = time if since is None else since, max(level, lowest)
         elif since is not None:
-            yield _low_charge_event(topic, since, time, lowest, is_begun=since not in begins)
+            goes_on, is_begun = time == MAX_NS, since not in begins
+            if goes_on and not is_begun and _says_zero(view, topic, since):
+                return
+            verb = "fell" if is_begun else "was"
+            text = f"{topic} {verb} below {LOW_CHARGES[lowest - 1]:.0%}"
+            yield Event("low battery", since, min(time, events.last), text, goes_on=goes_on)
             since, lowest = None, 0
-    if since is None or (since in begins and _says_zero(view, topic, since)):
-        return
-    is_begun = since not in begins
-    event = _low_charge_event(topic, since, events.last, lowest, is_begun=is_begun)
-    yield replace(event, goes_on=True)
-
-
-def _low_charge_event(topic: str, start: Ns, end: Ns, lowest: int, *, is_begun: bool) -> Event:
-    verb = "fell" if is_begun else "was"
-    text = f"{topic} {verb} below {LOW_CHARGES[lowest - 1]:.0%}"
-    return Event("low battery", start, end, text)
 
 
 def _says_zero(view: View, topic: str, at: Ns) -> bool:
@@ -577,8 +572,8 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
     past: dict[Event, tuple[PastChange, ...]] = {}
     for event in events:
         if event.kind == "flip":
-            own_sentence, _, _ = event.text.rpartition(" ")
-            past[event] = changes.before(event.start, without=own_sentence, beside=event.topic)
+            own, topic = _boolean_of(event), event.topic
+            past[event] = changes.before(event.start, without=own, beside=topic)
         elif event.kind in {"stop", "drop"}:
             past[event] = changes.before(event.start, slack=SLACK_NS)
     counts_shown = _counts_shown(past)
@@ -586,6 +581,11 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
         replace(event, before=past[event][: counts_shown[event]]) if event in past else event
         for event in events
     ]
+
+
+def _boolean_of(event: Event) -> str:
+    """Returns the sentence on a toggled boolean without its value; empty for another event."""
+    return event.text.rpartition(" ")[0] if event.kind == "flip" else ""
 
 
 def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> dict[Event, int]:
@@ -611,21 +611,25 @@ def _most_important(
 ) -> list[Event]:
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
-    `counts` has how many there are of each kind; there may be more than `events`. A note says how
-    many are left out.
+    What happens on any day comes last, the rare before the frequent: two changes of an emergency
+    stop, then the stops, then a door that opens all the time. `counts` has how many there are of
+    each kind; there may be more than `events`. A note says how many are left out.
     """
-    ranked = sorted(
-        events,
-        key=lambda event: (_KINDS.index(event.kind), event.start - (event.end or event.start)),
-    )
-    shown = ranked[:most]
+    alike = counts + Counter(map(_boolean_of, events))
+
+    def rank(event: Event) -> tuple[int, int, int, Ns]:
+        kind, often = _KINDS.index(event.kind), alike[_boolean_of(event) or event.kind]
+        lasted = (event.end or event.start) - event.start
+        return min(kind, _OF_ANY_DAY), often, kind, -lasted
+
+    shown = sorted(events, key=rank)[:most]
     left_out = counts - Counter(event.kind for event in shown)
     if left_out:
-        named = []
-        for kind in _KINDS:
-            if left_out[kind]:
-                singular = "sight of a thing" if kind == "thing" else kind
-                named.append(counted(left_out[kind], singular, _PLURALS[kind]))
+        named = [
+            counted(left_out[kind], "sight of a thing" if kind == "thing" else kind, several)
+            for kind, several in _PLURALS.items()
+            if left_out[kind]
+        ]
         view.notes.add(
             f"left out, because there are too many: {', '.join(named)}; ask for a shorter time"
         )

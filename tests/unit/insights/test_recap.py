@@ -16,7 +16,7 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.recap import recap
+from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.results import Recap
 from tests.support.bags import (
     McapLayout,
@@ -169,6 +169,29 @@ def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Pa
         "/landed in_air became true",
         "/armed became true",
     ]
+
+
+def test_of_many_stops_and_toggles_the_rare_are_listed_first(tmp_path: Path) -> None:
+    """Stands for 5 s 34 times; a door opens and closes 40 times, an emergency stop is set once."""
+    messages = []
+    for tick in range(34 * 8 * 5):
+        cycle, within_s = divmod(tick / 5, 8)
+        at = BEGIN + tick * S // 5
+        messages.append(odom(at, 1.5 * cycle + 0.5 * max(within_s - 5, 0)))
+        if tick % 5 == 0:
+            second = tick // 5
+            messages.append(boolean(at, second // 3 % 2 == 1, topic="/door"))
+            messages.append(boolean(at, 100 <= second < 110, topic="/emergency_stop"))
+    told = over(remembered(tmp_path, messages), 0, 34 * 8)
+    texts = [event.text for event in told.events]
+    assert [text for text in texts if not text.startswith("stood at")] == [
+        "/emergency_stop became true",
+        "/emergency_stop became false",
+    ]
+    assert len(texts) == MOST_EVENTS
+    assert dict(told.counts) == {"stops": 34, "on/off changes": 2 + 34 * 8 // 3}
+    [left_out] = [note for note in told.notes if note.startswith("left out, because")]
+    assert f"{34 - (MOST_EVENTS - 2)} stops, {34 * 8 // 3} on/off changes" in left_out
 
 
 def test_a_path_that_begins_or_ends_within_a_window_says_when_there_are_no_poses(

@@ -214,7 +214,10 @@ class Leg(NamedTuple):
         )
 
     def _linked(self, later: Leg, step_m: float) -> Leg:
-        """Returns this leg with the length and the ends of both; noise is known in both, or none."""
+        """Returns this leg with the length and the ends of both.
+
+        The noise of both is known, or of neither.
+        """
         head, tail, length_m = self.head, later.tail, self.length_m + later.length_m
         before, after = self.tail.creep, later.head.creep
         if before is not None and after is not None:
