@@ -313,11 +313,7 @@ class PieceNumbers:
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[_PieceRows]:
         """Yields the pieces that rows from log time `since` on lie in."""
-        first, last = rows.span
-        begin, end = (bisect_right(self._edges, at) for at in (first, last))
-        if begin == end and since <= first:
-            yield _PieceRows(begin, 0, len(rows))
-            return
+        begin, end = (bisect_right(self._edges, at) for at in rows.span)
         edges = np.append(since, self._edges[begin:end])
         least, *bounds = np.searchsorted(rows.times, edges).tolist()
         starts, stops = [0, *bounds], [*bounds, len(rows)]
@@ -502,7 +498,7 @@ def _exact_least(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
 
 
 class _FieldCell(NamedTuple):
-    """The numbers of a field in a bin; `min_at` and `max_at` are log times."""
+    """The numbers of a field in a bin, in the columns of a reply; `..._at` are log times."""
 
     min: float
     min_at: Ns
@@ -511,14 +507,6 @@ class _FieldCell(NamedTuple):
     mean: float
 
 
-_CELL_COLUMNS: Final[dict[str, BinColumn]] = {
-    "min": "number",
-    "min_at": "time",
-    "max": "number",
-    "max_at": "time",
-    "mean": "number",
-}
-"""The columns of a field in the reply, which are the attributes of `_FieldCell`."""
 _MEAN_DIGITS: Final = 12
 """So many digits are the same however a window is cut into bags: rounding does not reach them."""
 
@@ -567,8 +555,9 @@ def count_range(
             view.notes.add(f"{field} holds no number in the window")
             note_unnamed(view, name, [{field: None}], binned.counted.stop)
             continue
-        for column, kind in _CELL_COLUMNS.items():
+        for column in _FieldCell._fields:
             values = [None if cell is None else getattr(cell, column) for cell in cells]
+            kind: BinColumn = "time" if column.endswith("_at") else "number"
             binned.add(f"{field}.{column}", kind, values, getattr(window_cell, column))
     note_robots(view, name, binned.counted)
     note_no_fix(view, name, binned.counted, names)

@@ -6,8 +6,10 @@ Each moment or day is answered as if it were the only one.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import defaultdict
 from dataclasses import replace
-from datetime import datetime, time, timedelta
+from datetime import datetime, time
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
@@ -17,20 +19,22 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import NS_PER_S, START_SLACK_NS, Ns, Span, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, START_SLACK_NS
 from ros2_memory.counts.bins import local_offset
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
 from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt, OneAnswer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.history.context import Call, Memory
 
 MOST_WINDOWS: Final = 31
 """Days whose hours one call asks about."""
+_DAY_S: Final = 86_400
 
 
 def at_each(
@@ -149,45 +153,30 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
         raise InvalidArgumentsError(
             f"between takes at most {MOST_WINDOWS} days: ask about a shorter window, or by hour"
         )
-    nights = timedelta(days=1 if ends <= begins else 0)
-    parts = []
-    # From the day before: its hours may go on after midnight.
-    for nth in range(-1, (last - first).days + 1):
-        day = first + timedelta(days=nth)
-        begin, end = datetime.combine(day, begins), datetime.combine(day + nights, ends)
-        for span in _times_between(begin, end):
-            part = window.intersect(TimeWindow(*span))
+    begin_s, end_s = (of.hour * 3600 + of.minute * 60 + of.second for of in (begins, ends))
+    length_s = (end_s - begin_s) % _DAY_S or _DAY_S
+    spans_by_day: defaultdict[int, Spans] = defaultdict(list)
+    for stretch in _stretches_of_one_clock(window):
+        offset_s = local_offset(stretch.start // NS_PER_S)
+        today = (stretch.start // NS_PER_S + offset_s) // _DAY_S
+        # From the day before: its hours may go on after midnight.
+        for day in (today - 1, today, today + 1):
+            begin = (day * _DAY_S + begin_s - offset_s) * NS_PER_S
+            part = stretch.intersect(TimeWindow(begin, begin + length_s * NS_PER_S))
             if not part.empty:
-                parts.append(part)
+                spans_by_day[day].append((part.start, part.stop))
     # Where clocks go back, two parts of one day have a part of the other day between them.
-    return sorted(parts, key=lambda part: part.start)
+    parts = sorted(chain.from_iterable(map(united, spans_by_day.values())))
+    return [TimeWindow(*part) for part in parts]
 
 
-def _times_between(begin: datetime, end: datetime) -> list[Span]:
-    """Returns the times (ns) between two local times. Where clocks go back, there may be two."""
-    (first, again), (stop, stop_again) = _moments(begin), _moments(end)
-    if (first, stop) == (again, stop_again):
-        return [(first, stop)]
-    back = _change_between(first, again) if first < again else _change_between(stop, stop_again)
-    return [(first, min(stop, back)), (max(again, back), stop_again)]
-
-
-def _moments(local: datetime) -> Span:
-    """Returns the first and the last moment (ns) with a local time.
-
-    A local time that clocks skip has the moment of the change.
-    """
-    first, last = (ns_from_unix(local.replace(fold=fold).timestamp()) for fold in (0, 1))
-    if first <= last:
-        return first, last
-    # Clocks skip it: by the old offset the moment is later than by the new one.
-    change = _change_between(last, first)
-    return change, change
-
-
-def _change_between(before: Ns, after: Ns) -> Ns:
-    """Returns when clocks change between two moments (ns), to a second."""
-    seconds = range(before // NS_PER_S, after // NS_PER_S)
-    offset = local_offset(seconds.start)
-    passed_s = bisect_left(seconds, True, key=lambda at: local_offset(at) != offset)
-    return (seconds.start + passed_s) * NS_PER_S
+def _stretches_of_one_clock(window: TimeWindow) -> Iterator[TimeWindow]:
+    """Yields consecutive parts of a window, of a day at most, in which clocks do not change."""
+    start = window.start
+    while start < window.stop:
+        seconds = range(start // NS_PER_S, start // NS_PER_S + _DAY_S)
+        offset_s = local_offset(seconds.start)
+        lasts_s = bisect_left(seconds, True, key=lambda at: local_offset(at) != offset_s)
+        stop = min((seconds.start + lasts_s) * NS_PER_S, window.stop)
+        yield TimeWindow(start, stop)
+        start = stop
