@@ -135,6 +135,11 @@ def is_edge(pair: tuple[str, str]) -> bool:
     return bool(parent and child) and parent != child
 
 
+def is_odometry(frame: str) -> bool:
+    """Whether a frame is one of odometry, by its name."""
+    return frame.rpartition("/")[2].startswith("odom")
+
+
 def joined_edges(parts: Sequence[Edges]) -> Edges:
     """Returns the transforms of several tables; those of one edge in the order of the tables."""
     by_pair: dict[tuple[str, str], list[Edge]] = defaultdict(list)
@@ -329,8 +334,7 @@ class FrameTree:
         world = self._newest_chain(self.target)
         chain: list[str] = []
         for name in self._newest_chain(frame.lstrip("/")):
-            is_odometry = name == odometry or name.rpartition("/")[2].startswith("odom")
-            if name in world or is_odometry:
+            if name in world or name == odometry or is_odometry(name):
                 break
             chain.append(name)
         if not chain:

@@ -18,8 +18,9 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
+from ros2_memory.analysis.frames import is_odometry, joined_edges
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
+from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
@@ -29,15 +30,18 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.coverage import seconds, unix_text
+from ros2_memory.history.no_data import topics_of_robot
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import of_columns, scan
+from ros2_memory.history.transforms import edges_of_rows
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.holes import Pause
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.frames import Edges
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.arrays import Ints
@@ -146,24 +150,40 @@ def _steps_of_pause(view: View, pause: Pause) -> tuple[ClockStep, ...]:
     """Returns the step in a pause, if any; remembers it if the bags around are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
-    topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
-    key = (topic, pause.start, pause.end, *[bag.identity for bag in bags])
+    topics = _topics_placing(view)
+    key = (topics, pause.start, pause.end, *[bag.identity for bag in bags])
     cache = view.memory.scanner.caches.clock_steps
     steps = cache.get(key)
     if steps is None:
         with view.bags.watched() as reading:
-            step = _find_step(view, topic, pause)
+            step = _find_step(view, topics, pause)
         steps = () if step is None else (step,)
         if reading.is_final:
             cache.put(key, steps, _STEPS_BYTES)
     return steps
 
 
-def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
-    """Returns the step in a pause, by header stamps, else by the poses of a topic."""
+def _topics_placing(view: View) -> tuple[str, ...]:
+    """Returns the topics that show whether the robot drove: the one that places it comes alone.
+
+    Else those with its poses are returned, or those of transforms.
+    """
+    if view.pose_topic in view.timeline.topics() and view.pose_topic not in view.moving_topics:
+        return (view.pose_topic,)
+    return tuple(topics_of_robot(view, "position")) or view.moving_topics
+
+
+def _find_step(view: View, topics: Sequence[str], pause: Pause) -> ClockStep | None:
+    """Returns the step in a pause, by header stamps, else by the poses of one of the topics."""
     step = _step_by_stamps(view, pause)
-    if step is not None or topic is None or pause.length < SHORTEST_STEP_NS:
+    if step is not None or pause.length < SHORTEST_STEP_NS:
         return step
+    by_topics = (_step_by_poses(view, topic, pause) for topic in topics)
+    return next((found for found in by_topics if found is not None), None)
+
+
+def _step_by_poses(view: View, topic: str, pause: Pause) -> ClockStep | None:
+    """Returns the step in a pause by the poses of a topic, or by its transforms that move."""
     if _had_stalled(view, topic, pause):
         return None
     before = TimeWindow.before(pause.start, BESIDE_NS)
@@ -171,10 +191,16 @@ def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
     # A recording that ended before the pause tells nothing about one that began after it.
     recordings = {bag.recording for bag in view.timeline.overlapping(before)}
     recordings &= {bag.recording for bag in view.timeline.overlapping(after)}
+    read = _poses_of_frames if topic in view.moving_topics else _poses_of_recordings
     poses_before, poses_after = (
-        _poses_of_recordings(view, topic, window, recordings) for window in (before, after)
+        read(view, topic, window, recordings) for window in (before, after)
     )
-    return step_over(pause.span[0], poses_before, poses_after)
+    tried = (
+        step_over(pause.span[0], poses, poses_after[frame])
+        for frame, poses in poses_before.items()
+        if frame in poses_after
+    )
+    return next((step for step in tried if step is not None), None)
 
 
 def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
@@ -202,6 +228,9 @@ def _had_stalled(view: View, topic: str, pause: Pause) -> bool:
     sent = [] if first is None else [first.record.publish_time]
     for _, stamps in _stamps_by_recording(view, topic, after).values():
         sent += stamps.tolist()
+    if topic in view.moving_topics:
+        for edge in _edges(view, topic, after).values():
+            sent += edge.stamps.tolist()
     return any(pause.start + ALIKE_NS < at < pause.end - ALIKE_NS for at in sent)
 
 
@@ -226,11 +255,44 @@ def _stamps_by_recording(view: View, topic: str, window: TimeWindow) -> dict[Pat
 
 def _poses_of_recordings(
     view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
-) -> Poses:
-    """Returns the poses of some recordings in a window, without invalid positions."""
+) -> dict[str, Poses]:
+    """Returns by topic its poses in a window of some recordings, without invalid positions."""
     blocks = pose_rows(view, topic, window, among=recordings.__contains__)
     try:
         poses = joined_poses([rows.poses for rows in blocks])
     except InvalidArgumentsError:
-        return NO_POSES
-    return poses.rows(np.flatnonzero(are_places(poses.positions)))
+        return {}
+    return {topic: poses.rows(np.flatnonzero(are_places(poses.positions)))}
+
+
+def _poses_of_frames(
+    view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
+) -> dict[str, Poses]:
+    """Returns by frame its poses in odometry or in the map, by transforms of some recordings."""
+    edges = _edges(view, topic, window, among=recordings.__contains__)
+    poses: dict[str, Poses] = {}
+    for (parent, child), edge in edges.items():
+        if is_odometry(parent) or parent == view.limits.map_frame:
+            count = edge.log_times.size
+            frames = FrameCodes(np.zeros(count, np.uint32), (parent,))
+            speeds = np.full(count, np.nan)
+            placed = Poses(edge.log_times, edge.translation, edge.rotation, frames, speeds)
+            poses[child] = placed.rows(np.argsort(placed.times, kind="stable"))
+    return poses
+
+
+def _edges(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    *,
+    among: Callable[[Path], bool] = lambda _: True,
+) -> Edges:
+    """Returns the transforms of a topic that were recorded in a window."""
+    return joined_edges(
+        [
+            edges_of_rows(view, rows, view.sessions.session_of(rows.recording))
+            for rows in scan(view, topic, window)
+            if among(rows.recording)
+        ]
+    )

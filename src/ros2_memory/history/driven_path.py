@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.frames import joined_edges
+from ros2_memory.analysis.frames import is_odometry, joined_edges
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
     PathSlice,
@@ -423,11 +423,6 @@ def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
         frame = parents[frame]
         frames.append(frame)
     return frames
-
-
-def is_odometry(frame: str) -> bool:
-    """Whether a frame is one of odometry, by its name."""
-    return frame.rpartition("/")[2].startswith("odom")
 
 
 def _body_rank(frame: str, map_frame: str | None) -> int:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.frames import HOLD_NS
+from ros2_memory.analysis.frames import HOLD_NS, is_odometry
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, jumps, place_at
 from ros2_memory.core.errors import (
@@ -38,7 +38,6 @@ from ros2_memory.history.driven_path import (
     body_by_transforms,
     body_of,
     frame_of_newest_pose,
-    is_odometry,
     newest_of_body,
     resolve_path_topic,
     robot_body,

@@ -16,6 +16,8 @@ from tests.support.bags import (
     boolean,
     odom,
     text,
+    tf,
+    transform,
     write_db3,
     write_mcap,
     write_splits,
@@ -91,6 +93,46 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
         assert reply["duration_s"] == pytest.approx(100 - by, abs=0.05)
         later = asked(memory, "recap", start=BEGIN + 100, end=BEGIN + 150)
         assert "clock steps" not in later["counts"]
+
+
+def driven_topics(at: int, x: float) -> list[Msg]:
+    """What two filters and a localiser publish: no topic is called `/odom`."""
+    moved = transform(at, "odom", "base_link", (x, 0.0, 0.0))
+    placed = transform(at, "map", "odom", (0.0, 0.0, 0.0))
+    return [
+        odom(at, x, topic="/odometry/local"),
+        odom(at, x, topic="/odometry/global"),
+        tf(at, moved, placed),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("pose_topic", "published"),
+    [
+        ("/odom", ("/odometry/local", "/odometry/global", "/tf")),
+        ("/tf", ("/odometry/local", "/odometry/global", "/tf")),
+        ("/tf", ("/tf",)),
+        ("/odom", ("/tf",)),
+    ],
+)
+def test_a_clock_that_was_set_forward_is_reported_whatever_places_the_robot(
+    tmp_path: Path, pose_topic: str, published: Sequence[str]
+) -> None:
+    def at_beat(t: float) -> Iterator[Msg]:
+        at = BEGIN * S + round((t + 8.0 * (t > 54.95)) * S)
+        yield from (each for each in driven_topics(at, SPEED * t) if each.topic in published)
+        yield from [boolean(at + 1, data=False)] * (t % 1 == 0)
+
+    memory = written(tmp_path, at_beat)
+    placed = replace(memory, limits=replace(memory.limits, pose_topic=pose_topic))
+    for each in each_known(placed):
+        assert steps(each) == [
+            {
+                "at": pytest.approx(BEGIN + 54.9, abs=1e-5),
+                "step_s": pytest.approx(8.0, abs=0.01),
+            }
+        ]
+        assert asked(each, "data_time_range")["gaps"] == []
 
 
 def steps(memory: Memory) -> list[Any]:
