@@ -221,7 +221,7 @@ class _Asked(NamedTuple):
     def note_latched(self, stored: StoredMessage) -> None:
         """Notes the age of a latched message, for replies that do not show it."""
         if still_holds(self.view, stored, self.at):
-            age = seconds(max(self.at - stored.time, 0))
+            age = seconds(_age_of_latched(self.view, stored, self.at))
             still = f"its value of {age} before is still valid"
             self.view.notes.add(f"{stored.topic} is latched: {still}")
 
@@ -1046,8 +1046,14 @@ def _with_latched_age(
     """Returns a value, marked with its age if it is latched."""
     if not still_holds(view, stored, at):
         return value
-    age = max(at - stored.time, 0) if value.age is None else value.age
-    return replace(value, latched=True, age=age)
+    age = _age_of_latched(view, stored, at) if value.age is None else value.age
+    notes = tuple(dict.fromkeys((*value.notes, *view.notes.sentences())))
+    return replace(value, latched=True, age=age, notes=notes)
+
+
+def _age_of_latched(view: View, stored: StoredMessage, at: Ns) -> Ns:
+    """Returns how long before a moment a message was received, without what the clock skipped."""
+    return max(view.elapsed_in(TimeWindow(stored.time, at + 1)).between(stored.time, at), 0)
 
 
 def _decode_shown(

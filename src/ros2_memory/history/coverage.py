@@ -619,7 +619,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(before, after) > _EDGE_NS:
-        length = end - start
+        length = view.elapsed_in(counted_window).between(start, end)
         recorded = max(length - before - after - sum(gaps), 0)
         digits = 0 if length >= 100 * NS_PER_S else 1
         recorded_s = f"{unix_from_ns(recorded):.{digits}f}"

@@ -527,7 +527,8 @@ def require_fields(view: View, topic: str, fields: Sequence[str], until: Ns) -> 
 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:
-    """Returns the error with all notes, and with notes on unread data of the window."""
+    """Returns the error with all notes, also on clock steps and unread data in the window."""
+    view.elapsed_in(window)
     note_unread(view, window, nothing=True)
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 

@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.clock_steps import without_steps
+from ros2_memory.history.clock_steps import elapsed_in, without_steps
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
@@ -46,6 +46,7 @@ from ros2_memory.index.segment import TopicTotals
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.columns.scan import Scan
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
@@ -173,6 +174,10 @@ class View:
         # Most windows have no pause: then the gaps, which follow from all bags, are not needed.
         gaps = [gap for gap in self.snapshot.gaps if gap in pauses] if pauses else []
         return without_steps(self, gaps) if gaps else gaps
+
+    def elapsed_in(self, window: TimeWindow) -> Elapsed:
+        """Returns how much time passed between moments of a window, with a note on each step."""
+        return elapsed_in(self, window)
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns by type the totals of a topic, each message counted once.

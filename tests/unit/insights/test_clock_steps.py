@@ -95,6 +95,41 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
         assert "clock steps" not in later["counts"]
 
 
+def test_what_the_clock_skipped_is_neither_recorded_nor_missing(tmp_path: Path) -> None:
+    """A window from 100 s before the memory to its end; a moment, and a window, in the step."""
+    plain = recorded(tmp_path, shown=lambda t: t + 500.0 * (t > 54.95))
+    note = f"the clock was set 500 s ahead at {BEGIN + 54}.900000: durations are without that"
+    for memory in each_known(plain):
+        reply = asked(memory, "recap", start=BEGIN - 100, end=BEGIN + 659.9)
+        assert note in reply["notes"]
+        window = f"between {BEGIN - 100}.000000 and {BEGIN + 659}.900000"
+        assert f"recorded only 160 of 260 s {window}" in reply["notes"]
+        for tool, inside in {
+            "get_position_at": {"timestamp": BEGIN + 300},
+            "get_topic_in_range": {"topic": "/odom", "start": BEGIN + 300, "end": BEGIN + 400},
+        }.items():
+            missing = asked(memory, tool, **inside)
+            assert (missing["error"], missing["notes"]) == ("no_data", [note])
+
+
+def test_the_age_of_a_latched_value_is_without_what_the_clock_skipped(tmp_path: Path) -> None:
+    messages = [text(BEGIN * S + 50 * S, "on", topic="/mode")]
+    for beat in range(160 * HZ):
+        at = BEGIN * S + beat * S // HZ + 500 * S * (beat > 549)
+        messages += [odom(at, SPEED * beat / HZ), boolean(at + 1, data=False)]
+    messages.sort(key=lambda message: message.log_time)
+    layout = McapLayout(latched=frozenset({"/mode"}))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, layout)
+    plain = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
+    for memory in each_known(plain):
+        found = asked(memory, "get_topic_at_time", topic="/mode", timestamp=BEGIN + 600)
+        assert (found["latched"], found["age_s"]) == (True, pytest.approx(50, abs=0.01))
+        assert "the clock was set 500 s ahead" in str(found["notes"])
+        when = {"condition_topic": "/odom", "condition_type": "above", "field": "position.x"}
+        matched = asked(memory, "get_value_when", value_topic="/mode", value=79, **when)
+        assert matched["value_age_s"] == pytest.approx(109.9, abs=0.01)
+
+
 def driven_topics(at: int, x: float) -> list[Msg]:
     """What two filters and a localiser publish: no topic is called `/odom`."""
     moved = transform(at, "odom", "base_link", (x, 0.0, 0.0))
