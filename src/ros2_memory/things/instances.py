@@ -17,6 +17,7 @@ import numpy as np
 from ros2_memory.analysis.sights import Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Flags, Groups, Ints, begins_of, in_ranges, narrowed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
+from ros2_memory.things.places import visits_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -265,9 +266,17 @@ class Estimate:
         """Returns how many things of one label stand at one place, by the spots there.
 
         Places are no finer than the noise of far detections, but two spots of one message are never
-        one thing. A slice counts the spots that it saw at least half as often as the one it saw
-        most. Only spots seen three times in their slice count, or as often as a slow detector sees
-        any.
+        one thing. The newest slices count, and those of the last visit alone if they have more:
+        what came since the visit before was not there to be seen in it.
+        """
+        visits = visits_of(*(self.spots[rows, name] for name in (Spot.FIRST, Spot.LAST)))
+        return max(self._side_by_side_of(seen) for seen in (rows, rows[visits == visits[-1]]))
+
+    def _side_by_side_of(self, rows: Ints) -> int:
+        """Returns the median number of things side by side in the newest slices of some spots.
+
+        A slice counts the spots that it saw at least half as often as the one it saw most. Only
+        spots seen three times in their slice count, or as often as a slow detector sees any.
         """
         counts = self.counts[rows]
         is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))

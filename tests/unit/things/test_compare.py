@@ -69,6 +69,20 @@ def test_things_that_stand_together_are_compared_by_their_number(tmp_path: Path)
     assert (same["things"], same["things_unchanged"]) == ({}, 1)
 
 
+def test_one_more_that_came_since_the_visit_before_stands_beside_the_other(tmp_path: Path) -> None:
+    """Although it was not there in most of the times that the robot looked."""
+    cup, came = ("cup", 3.0, 0.0), ("cup", 3.0, 0.25)
+    visits = [message for at in range(0, 1000, 100) for message in looked(at, at + 10, HERE, cup)]
+    reply = compared(
+        tmp_path, [*visits, *looked(1000, 1020, HERE, cup, came)], with_end=BEGIN + 999,
+        start=BEGIN + 1000, end=BEGIN + 1020,
+    )  # fmt: skip
+    [more] = reply["things"]["more_or_fewer"]
+    assert (more["was"]["at_once"], more["is"]["at_once"]) == (1, 2)
+    found = ask(tmp_path, "find_things", label="cup")
+    assert (found["total"], found["things"][0]["at_once"]) == (2, 2)
+
+
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
     stood = looked(0, 30, HERE, BOOK, in_map=False)
     later = looked(60, 90, (3.0, 0.0, 0.0), BOOK, in_map=False)
