@@ -384,7 +384,8 @@ def _state_at_end(
             yield flag_name(topic, flag), bool(flag.last)
         goals, _ = events.of_kind(GOAL)
         if goals:
-            newest = max(goals, key=lambda state: (state.at, state.last in _ACTIVE_GOAL))
+            # Servers list the newest goal last.
+            newest = max(goals[::-1], key=lambda state: (state.at, state.last in _ACTIVE_GOAL))
             word = GOAL_WORDS.get(newest.last, "active")
             is_active = newest.last in _ACTIVE_GOAL
             if is_active and last_listings(view, topic, window, {newest.name}):

@@ -382,6 +382,18 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
         assert (stop["timestamp"], stop.get("before")) == (T0 + 600, None)
 
 
+@pytest.mark.parametrize("moment", [142, 200])
+def test_of_goals_that_all_ended_before_the_newest_is_the_state(
+    tmp_path: Path, moment: int
+) -> None:
+    """A server lists its goals as it accepted them, for minutes after they ended."""
+    listed = [goals(at(10), {1: 4, 2: 4}), goals(at(30), {1: 4, 2: 4, 3: 2})]
+    listed.append(goals(at(141), {1: 4, 2: 4, 3: 6}))
+    write_mcap(tmp_path / "bag.mcap", [*(odom(at(nth)) for nth in range(250)), *listed])
+    reply = asked(memory_of(tmp_path), "recap", around=at(moment) / S)
+    assert reply["state"]["/drive goal"] == "aborted"
+
+
 @pytest.mark.parametrize("ended", [1, 2])
 def test_a_goal_that_runs_is_the_state_beside_an_older_one_that_stays_listed(
     tmp_path: Path, ended: int
