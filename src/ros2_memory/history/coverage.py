@@ -613,14 +613,14 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
         end = min(end, until)
     counted_window = TimeWindow(start, end)
     before, after = max(min(end, first) - start, 0), max(end - max(start, last), 0)
-    gaps = [stop - begin for begin, stop in recording_gaps(view, counted_window)]
+    gaps = sum(stop - begin for begin, stop in recording_gaps(view, counted_window))
     when = f"between {unix_text(start)} and {unix_text(end)}"
     deleted = was_removed(view, counted_window)
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(before, after) > _EDGE_NS:
         length = view.elapsed_in(counted_window).between(start, end)
-        recorded = max(length - before - after - sum(gaps), 0)
+        recorded = max(length - before - after - gaps, 0)
         digits = 0 if length >= 100 * NS_PER_S else 1
         recorded_s = f"{unix_from_ns(recorded):.{digits}f}"
         of_s = f"{unix_from_ns(length):.{digits}f}"
@@ -679,10 +679,12 @@ def is_missed(snapshot: Snapshot, window: TimeWindow, start: Ns, end: Ns) -> boo
     return stop - begin > least or (begin, stop) == (first, last)
 
 
-def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:
+def recording_gaps(
+    view: View, window: TimeWindow | None = None, *, steps: bool = False
+) -> Iterator[Span]:
     """Yields the gaps (in a window, cut at its bounds); see `View.gaps`."""
     asked = window or TimeWindow.everything()
-    for start, end in view.gaps(asked):
+    for start, end in view.gaps(asked, steps=steps):
         yield max(start, asked.start), min(end, asked.stop)
 
 
@@ -702,7 +704,7 @@ def unknown_times(
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (0, 0)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
-    gaps = united(recording_gaps(view))
+    gaps = united(recording_gaps(view, steps=True))  # the time that the clock skipped never was
     between = without([around], united([*known, *mixed, *gaps]))
     long = [(begin, stop) for begin, stop in between if stop - begin > SILENCE_NS]
     unknown: Spans = []

@@ -382,7 +382,9 @@ def no_data_at(
     else:
         reason = reason_between(view, window)
         is_in_gap = bool(view.gaps(this_moment, around=True))
-        if around is None and reason is NoDataReason.GAP and not is_in_gap:
+        if not is_in_gap and view.gaps(this_moment, around=True, steps=True):
+            why = ["the clock skipped this time, as it was set ahead"]
+        elif around is None and reason is NoDataReason.GAP and not is_in_gap:
             reason, why = _reason_within_recording(view, older, newer)
     if (
         deleted

@@ -159,8 +159,10 @@ class View:
                 thinned = overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1)
                 self.call.used_thinned |= thinned
 
-    def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[Span]:
-        """Returns the gaps that overlap a window, without steps of the clock.
+    def gaps(
+        self, window: TimeWindow, *, around: bool = False, steps: bool = False
+    ) -> Sequence[Span]:
+        """Returns the gaps that overlap a window, without steps of the clock unless `steps`.
 
         With `around`, only a gap that has the whole window inside.
         """
@@ -173,7 +175,7 @@ class View:
         }
         # Most windows have no pause: then the gaps, which follow from all bags, are not needed.
         gaps = [gap for gap in self.snapshot.gaps if gap in pauses] if pauses else []
-        return without_steps(self, gaps) if gaps else gaps
+        return without_steps(self, gaps) if gaps and not steps else gaps
 
     def elapsed_in(self, window: TimeWindow) -> Elapsed:
         """Returns how much time passed between moments of a window, with a note on each step."""

@@ -170,6 +170,17 @@ def test_a_clock_that_was_set_forward_is_reported_whatever_places_the_robot(
         assert asked(each, "data_time_range")["gaps"] == []
 
 
+def test_the_time_that_a_clock_skipped_is_neither_recorded_nor_unknown(tmp_path: Path) -> None:
+    memory = recorded(tmp_path, shown=lambda t: t + 95 * (t > 79.95))
+    whole = {"start": BEGIN, "end": BEGIN + 400}
+    notes = asked(memory, "trajectory_summary", **whole)["notes"]
+    assert f"recorded only 160 of 305 s between {BEGIN}.000000 and {BEGIN + 400}.000000" in notes
+    other = {"with_start": BEGIN, "with_end": BEGIN + 50}
+    assert "is not known from" not in str(asked(memory, "compare", **whole, **other)["notes"])
+    error = asked(memory, "get_position_at", timestamp=BEGIN + 100)
+    assert "the clock skipped this time, as it was set ahead" in error["detail"]
+
+
 def steps(memory: Memory) -> list[Any]:
     found: list[Any] = asked(memory, "data_time_range")["clock_steps"]
     return found
