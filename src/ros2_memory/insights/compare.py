@@ -70,6 +70,7 @@ from ros2_memory.things.unseen import (
     describe_hung,
     look_alike_notes,
     note_undecoded,
+    renamed_notes,
     scatter_notes,
     unplaced_notes,
     vague_notes,
@@ -289,6 +290,9 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     between = _ThingsBetween(things, earlier, later, where, places)
     compared, moves = between.compare()
     view.notes.add(*look_alike_notes(things, moves), *scatter_notes(between.scattered(compared)))
+    missed = {thing.label for thing in compared.not_seen_where_expected}
+    instances = (thing for thing in things.estimate.instances if thing.label in missed)
+    view.notes.add(*renamed_notes(things, islice(instances, _MOST_SCATTERED)))
     return frame, compared
 
 

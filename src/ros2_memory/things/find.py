@@ -42,6 +42,7 @@ from ros2_memory.things.unseen import (
     look_alike_notes,
     note_undecoded,
     notes_on,
+    renamed_notes,
     scatter_notes,
 )
 
@@ -117,6 +118,8 @@ def find_things(
         view.notes.add(describe_misdated(view.snapshot.misdated))
     shown = tuple(finder.describe(thing) for thing in found[:limit])
     view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
+    instances = [thing.thing for thing in found[:limit] if isinstance(thing.thing, Instance)]
+    view.notes.add(*renamed_notes(known, instances))
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1

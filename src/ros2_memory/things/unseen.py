@@ -10,7 +10,7 @@ import math
 import re
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import chain, combinations, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
-from ros2_memory.things.labels import plain, singular
+from ros2_memory.things.labels import last_word, plain, singular
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
@@ -58,12 +58,13 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import Vector3
     from ros2_memory.history.stored_message import StoredMessage
-    from ros2_memory.things.instances import Move
+    from ros2_memory.things.instances import Instance, Move
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
 _SCATTERS: Final = 3.0
 """Things of one label that are no farther apart than so many times their scatter may be one."""
+_SAME_PLACE_M: Final = 0.2
 _MOST_TYPES: Final = 3
 """The constants of this many types are looked up: each reads the channels of a file."""
 _ARTICLE: Final = re.compile(r"^(?:an?|the) ")
@@ -412,6 +413,30 @@ def look_alike_notes(known: KnownThings, moves: Iterable[Move]) -> Iterator[str]
             f"{listed(labels, at_most=_MOST_NAMED)}",
             most,
         )
+
+
+def renamed_notes(known: KnownThings, things: Iterable[Instance]) -> Iterator[str]:
+    """Yields of things that are not seen any more what of their kind is seen at their place since.
+
+    A detector with other words calls the same thing otherwise: a "coffee mug" is no "mug" to it.
+    """
+    missed = [thing for thing in things if thing.missed_by is not None]
+    kinds = {last_word(thing.key) for thing in missed}
+    of_kinds = [other for other in known.estimate.instances if last_word(other.key) in kinds]
+    for thing, other in product(missed, of_kinds):
+        gone, came = thing.stays[-1], other.stays[0]
+        if (
+            other.key != thing.key
+            and (last_word(other.key), other.epoch) == (last_word(thing.key), thing.epoch)
+            and came.first > gone.last
+            and math.dist(came.at, gone.at) <= _SAME_PLACE_M
+            and not known.labels.are_apart(thing.key, other.key)
+        ):
+            yield repeating(
+                f"{other.label} is seen where {thing.label} was, since {unix_text(came.first)}: "
+                "it may be the same thing by another word",
+                [thing.label, other.label],
+            )
 
 
 def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator[str]:

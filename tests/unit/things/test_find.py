@@ -483,6 +483,27 @@ def test_labels_of_two_things_stay_two(
     assert ask(tmp_path, limits)["labels"] == dict.fromkeys(labels, 1)
 
 
+@pytest.mark.parametrize(
+    ("words", "is_told"),
+    [(("mug", "coffee mug"), True), (("coffee mug", "mug"), True), (("mug", "cup"), False)],
+)
+def test_what_a_detector_with_other_words_may_call_a_thing_is_said(
+    tmp_path: Path, words: tuple[str, str], is_told: bool
+) -> None:
+    """An open-vocabulary detector finds only what it was told to look for."""
+    seen = [looked(60 * nth, 60 * nth + 30, HERE, (words[nth], 3.0, 0.5)) for nth in range(2)]
+    write_splits(tmp_path, [*seen[0], *seen[1]])
+    told = f"{words[1]} is seen where {words[0]} was, since {BEGIN + 60}.000000: it may be the same"
+    reply = ask(tmp_path, QuerySettings(), label=words[0])
+    assert "not_seen_where_expected" in reply["things"][0]["still_there"]
+    assert (told in str(reply.get("notes"))) is is_told
+    window = {"with_start": BEGIN, "with_end": BEGIN + 29, "start": BEGIN + 60, "end": BEGIN + 89}
+    compared = asked(memory_of(tmp_path, limits=QuerySettings()), "compare", **window)
+    assert (told in str(compared.get("notes"))) is is_told
+    apart = QuerySettings(labels={word: [] for word in words})
+    assert told not in str(ask(tmp_path, apart, label=words[0]))
+
+
 @pytest.mark.parametrize("label", ["forklift", "Fork_Lift", "forklifts"])
 def test_labels_that_differ_in_spacing_only_name_one_thing(tmp_path: Path, label: str) -> None:
     """Two detectors write it otherwise, and each saw it at another time."""
