@@ -42,7 +42,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import clock_steps, elapsed_in
 from ros2_memory.history.condition_hints import compared_frames, position_frames
-from ros2_memory.history.conditions import condition_of, note_no_fix, types_matching
+from ros2_memory.history.conditions import Sought, condition_of, note_no_fix, types_matching
 from ros2_memory.history.coverage import (
     by_remark,
     describe_gaps,
@@ -89,6 +89,7 @@ from ros2_memory.history.robots import (
 from ros2_memory.history.scan import pick
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import (
+    ANY_TIME,
     AtTime,
     TimeRange,
     View,
@@ -566,23 +567,17 @@ def frames(memory: Memory, call: Call) -> results.Frames:
 def find_last_match(
     memory: Memory,
     call: Call,
-    topic: str,
-    condition_type: str,
-    value: JsonValue,
+    sought: Sought,
     *,
-    field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
-    min_score: float | None = None,
 ) -> results.Match:
-    """Returns the newest message of a topic, or of all topics of a glob, that meets a condition.
+    """Returns the newest message that meets the condition that is sought.
 
-    With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
-    with a score below `min_score` do not count.
+    With `before_s` (Unix seconds) only messages up to and including then are searched.
     """
     now, until = memory.clock.now(), _search_end(before_s)
-    search = _Search(topic, condition_type, value, field, min_score, until)
-    found = _last_match(View(memory, call, min(now, until)), search)
+    found = _last_match(View(memory, call, min(now, until)), sought, until)
     if isinstance(found, results.Match):
         return found
     view, match = found
@@ -603,25 +598,20 @@ def value_when(
     memory: Memory,
     call: Call,
     value_topic: str,
-    condition_topic: str,
+    sought: Sought,
     *,
-    condition_type: str,
-    value: JsonValue,
-    field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
-    min_score: float | None = None,
 ) -> results.ValueWhen | results.Match:
-    """Returns a topic's value at or before the last time that another topic met a condition.
+    """Returns a topic's value at or before the last time that what is sought was so.
 
     Or that there was no match. With `before_s` (Unix seconds) only matches up to and including then
-    count. Detections with a score below `min_score` do not.
+    count.
     """
     now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, min(now, until))
     name = _resolve_in_days(view, value_topic)
-    search = _Search(condition_topic, condition_type, value, field, min_score, until)
-    found = _last_match(view, search)
+    found = _last_match(view, sought, until)
     if isinstance(found, results.Match):
         return found
     days, match = found
@@ -719,7 +709,7 @@ def _topic_rows(view: View) -> Iterator[results.TopicRow]:
 
 
 def data_time_range(
-    memory: Memory, call: Call, start_s: float | None = None, end_s: float | None = None
+    memory: Memory, call: Call, span: TimeRange = ANY_TIME
 ) -> results.DataTimeRange:
     """Returns what the memory spans, where it has gaps, and which files do not answer.
 
@@ -730,7 +720,7 @@ def data_time_range(
         InvalidArgumentsError: the bounds make no window.
     """
     now = memory.clock.now()
-    window = search_window(TimeRange(start_s, end_s), now)
+    window = search_window(span, now)
     view = View(memory, call, now if memory.limits.now == "wall" else None)
     view.bags.track_all_sources()
     snapshot = view.snapshot
@@ -885,17 +875,6 @@ def _note_unsearched(view: View, match: StoredMessage, until: Ns, now: Ns) -> No
     note_unread(view, TimeWindow(match.time, max(stop, match.time + 1)), search=True)
 
 
-class _Search(NamedTuple):
-    """A search for the last match of a condition before a log time (ns)."""
-
-    topic: str
-    condition_type: str
-    value: JsonValue
-    field: str | None
-    min_score: float | None
-    until: Ns
-
-
 def _resolve_in_days(view: View, name: str) -> str:
     """Returns the recorded topic with a name, be it of days before those of a view.
 
@@ -908,7 +887,9 @@ def _resolve_in_days(view: View, name: str) -> str:
     return resolve_topic(view, name)
 
 
-def _last_match(view: View, search: _Search) -> tuple[View, StoredMessage] | results.Match:
+def _last_match(
+    view: View, sought: Sought, until: Ns
+) -> tuple[View, StoredMessage] | results.Match:
     """Returns the last match, with the view of the days that have it; or that there is none.
 
     `view` shows the newest days to search.
@@ -922,7 +903,7 @@ def _last_match(view: View, search: _Search) -> tuple[View, StoredMessage] | res
     searched_to = MAX_NS
     for days in days_back(view):
         try:
-            match, notes_on_days = _last_match_in(days, search)
+            match, notes_on_days = _last_match_in(days, sought, until)
         except NoDataError as error:
             missed = missed or error
         except QueryTimeoutError as error:
@@ -940,46 +921,42 @@ def _last_match(view: View, search: _Search) -> tuple[View, StoredMessage] | res
     return missed or results.Match(None)
 
 
-def _last_match_in(view: View, search: _Search) -> tuple[StoredMessage | None, tuple[str, ...]]:
+def _last_match_in(
+    view: View, sought: Sought, until: Ns
+) -> tuple[StoredMessage | None, tuple[str, ...]]:
     """Returns the last match in the days that a view shows, or the notes on finding none.
 
     Raises:
         NoDataError: the days have nothing that could be searched.
         QueryTimeoutError: the call's time is over.
     """
-    condition = condition_of(
-        view,
-        search.topic,
-        search.condition_type,
-        search.value,
-        field=search.field,
-        min_score=search.min_score,
-    )
-    reverse_search = ReverseSearch(view, search.topic, condition)
-    if search.until < MAX_NS:
-        require_recorded(view, TimeWindow(MIN_NS, search.until))
-    match = reverse_search.newest(search.until)
+    reverse_search = ReverseSearch(view, sought.topic, condition_of(view, sought))
+    if until < MAX_NS:
+        require_recorded(view, TimeWindow(MIN_NS, until))
+    match = reverse_search.newest(until)
     if match is None:
-        notes = _notes_on_never(view, search, reverse_search)
-        lists_goals = GOALS in types_matching(view, search.topic)
+        notes = _notes_on_never(view, sought, reverse_search, until)
+        lists_goals = GOALS in types_matching(view, sought.topic)
         return None, (_ENDED_GOALS, *notes) if lists_goals else notes
     if match.type == GOALS:
         view.notes.add(_ENDED_GOALS)
     return match, ()
 
 
-def _notes_on_never(view: View, search: _Search, reverse_search: ReverseSearch) -> tuple[str, ...]:
+def _notes_on_never(
+    view: View, sought: Sought, reverse_search: ReverseSearch, until: Ns
+) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null.
 
     They tell what was not read, and when recording was interrupted or topics were silent.
     """
-    window, condition = TimeWindow(MIN_NS, search.until), reverse_search.condition
+    window, condition = TimeWindow(MIN_NS, until), reverse_search.condition
     topics = reverse_search.topics
     notes = (
         *not_covered(view, topics, window),
         *describe_gaps(view, window, explained=True),
         *describe_unsearched(view, topics, window),
-        *notes_on_never(view, search.topic, condition, window, search.min_score),
+        *notes_on_never(view, sought, condition, window),
     )
     if notes or _may_be_elsewhere(view, topics, condition):
         return (*notes, *compared_frames(view, topics, condition))

@@ -16,6 +16,7 @@ from ros2_memory.columns.store import ColumnStore
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
@@ -67,18 +68,19 @@ def told(
     place = '{"x": 4.0, "y": 0.0}'
 
     def last(wanted: str) -> Callable[[], object]:
-        return partial(queries.find_last_match, memory, Call(), "/vision/*", "contains", wanted)
+        sought = Sought("/vision/*", "contains", wanted)
+        return partial(queries.find_last_match, memory, Call(), sought)
 
     asked: list[Callable[[], object]] = [
         lambda: queries.list_recorded_topics(memory, Call()),
         lambda: queries.frames(memory, Call()),
         *(last(wanted) for wanted in ("thing3", "never", "cup", f"thing{count - 1}")),
-        lambda: queries.find_last_match(memory, Call(), "/odom", "near_position", place),
+        lambda: queries.find_last_match(memory, Call(), Sought("/odom", "near_position", place)),
         lambda: queries.trajectory_summary(memory, Call(), span),
         lambda: queries.topic_value(memory, Call(), "/odom", AtTime(at_s=T0_S + 42.0)),
         lambda: recap(memory, Call(), span),
         lambda: visits(memory, Call(), 4.0, 0.0),
-        lambda: find_matches(memory, Call(), "/vision/*", "contains", "cup"),
+        lambda: find_matches(memory, Call(), Sought("/vision/*", "contains", "cup")),
     ]
     answers = []
     for ask in asked:

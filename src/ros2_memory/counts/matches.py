@@ -41,7 +41,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
 from ros2_memory.counts.labels import BY_LABEL, count_labels, read_labels
 from ros2_memory.history.clock_steps import elapsed_in
-from ros2_memory.history.conditions import condition_of
+from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
     note_edges,
@@ -62,10 +62,10 @@ from ros2_memory.history.held_values import (
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
-from ros2_memory.history.view import TimeRange, View, clamped, open_search
+from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before, message_before
-from ros2_memory.places.where import Scope, Where, WhileCondition, heard_times, parse_where
+from ros2_memory.places.where import Scope, Where, heard_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
 
@@ -92,18 +92,12 @@ class _HeldSpan(NamedTuple):
 def count_matches(
     memory: Memory,
     call: Call,
-    topic: str,
-    condition_type: str,
-    value: JsonValue,
+    sought: Sought,
     *,
     by: By | Literal["label", "value"],
-    field: str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    last_s: float | None = None,
-    min_score: float | None = None,
+    span: TimeRange = ANY_TIME,
     where: JsonValue = None,
-    during: Sequence[WhileCondition] = (),
+    during: Sequence[Sought] = (),
 ) -> Bins:
     """Returns how often and how long a condition held in each bin, and how long was recorded.
 
@@ -118,11 +112,11 @@ def count_matches(
         NoDataError: nothing is recorded in the window, or no such topic.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    view, _, window = open_search(memory, call, TimeRange(start_s, end_s, last_s))
+    view, _, window = open_search(memory, call, span)
+    topic, value = sought.topic, sought.value
     any_label = by == BY_LABEL and value == ""
     # No condition takes a blank text.
-    tested = "any" if any_label else value
-    condition = condition_of(view, topic, condition_type, tested, field=field, min_score=min_score)
+    condition = condition_of(view, sought._replace(value="any") if any_label else sought)
     asked = clamped(view, window)
     if by == BY_LABEL:
         window = shown_window(view.snapshot, asked)
@@ -147,9 +141,7 @@ def count_matches(
     binned.add_held(held.spans)
     if not held.spans.size:
         bounded = scope.is_bounded
-        view.notes.add(
-            *notes_on_never(view, topic, condition, asked, min_score, is_bounded=bounded)
-        )
+        view.notes.add(*notes_on_never(view, sought, condition, asked, is_bounded=bounded))
     return binned.answer()
 
 

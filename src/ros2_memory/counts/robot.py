@@ -20,7 +20,15 @@ from ros2_memory.history.driven_path import (
     resolve_path_topic,
 )
 from ros2_memory.history.robots import note_robots, require_one_robot
-from ros2_memory.history.view import TimeRange, View, clamped, open_span, open_view, search_window
+from ros2_memory.history.view import (
+    ANY_TIME,
+    TimeRange,
+    View,
+    clamped,
+    open_span,
+    open_view,
+    search_window,
+)
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
@@ -118,8 +126,7 @@ def count_visits(
     where: JsonValue = None,
     frame_id: str | None = None,
     radius_m: float | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
+    span: TimeRange = ANY_TIME,
 ) -> Bins:
     """Returns entries, exits and minutes in a place for each bin; without a place, in all named.
 
@@ -139,7 +146,7 @@ def count_visits(
             "by place counts the places of where, or all named ones: give where in place of x and y"
         )
     wall = memory.clock.now()
-    window = search_window(TimeRange(start_s, end_s), wall)
+    window = search_window(span, wall)
     view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
     topic = resolve_path_topic(view)

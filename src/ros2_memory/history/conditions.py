@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from contextlib import suppress
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.conditions import Beyond, Condition, parse_condition
 from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE
@@ -29,33 +29,36 @@ _FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
 _FIX_FIELDS: Final = frozenset({"latitude", "longitude", "altitude"})
 
 
-def condition_of(
-    view: View,
-    pattern: str,
-    condition_type: str,
-    value: JsonValue,
-    *,
-    field: str | None,
-    min_score: float | None,
-) -> Condition:
-    """Returns the condition of a question.
+class Sought(NamedTuple):
+    """What a question searches for: a condition as it was asked.
 
-    If all topics have one type, the value may be the name of a level (WARN) of a log or status, or
-    of a constant of the message definition if the field is a number.
-
-    Args:
-        view: of the call.
-        pattern: name or glob of the topics.
+    Attributes:
+        topic: name or glob of the topics.
         condition_type: such as "equals".
         value: what is compared.
         field: dot-path; may be a full path in the messages. Not needed for equal levels.
         min_score: least score of detections; None for the configured one.
+    """
+
+    topic: str
+    condition_type: str
+    value: JsonValue
+    field: str | None = None
+    min_score: float | None = None
+
+
+def condition_of(view: View, sought: Sought) -> Condition:
+    """Returns the condition of a question.
+
+    If all topics have one type, the value may be the name of a level (WARN) of a log or status, or
+    of a constant of the message definition if the field is a number.
 
     Raises:
         NoDataError: no such topic is recorded.
         InvalidArgumentsError: it is no condition.
     """
     limits = view.limits
+    pattern, condition_type, value, field, min_score = sought
     least = limits.min_score if min_score is None else min_score
     types = types_matching(view, pattern)
     type_name = next(iter(types)) if len(types) == 1 else ""

@@ -262,6 +262,9 @@ class TimeRange:
         return cls(start_s, max(unix_from_ns(window.stop - 1), start_s + 0.001))
 
 
+ANY_TIME: Final = TimeRange()
+
+
 def days_back(view: View) -> Iterator[View]:
     """Yields a view, then views of the days before it, as long as there is time to read them.
 

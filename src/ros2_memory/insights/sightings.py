@@ -24,7 +24,7 @@ from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.condition_hints import compared_frames
-from ros2_memory.history.conditions import condition_of
+from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import (
@@ -39,7 +39,7 @@ from ros2_memory.history.no_data import matching_topics, require_fields, require
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
-from ros2_memory.history.view import TimeRange, View, clamped, open_search
+from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
 from ros2_memory.insights.episodes import (
     MOST_COUNTED,
     MeanwhileReader,
@@ -52,7 +52,7 @@ from ros2_memory.insights.silences import describe_unsearched
 from ros2_memory.insights.topic_events import GoalRun, goals_matching
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at, with_place
-from ros2_memory.places.where import Scope, WhileCondition
+from ros2_memory.places.where import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 from ros2_memory.things.unseen import notes_on_never
 
@@ -74,31 +74,24 @@ _LEFT_TO_SAY_S: Final = 2.0
 def find_matches(
     memory: Memory,
     call: Call,
-    topic: str,
-    condition_type: str,
-    value: JsonValue,
+    sought: Sought,
     *,
-    field: str | None = None,
     fields: Sequence[str] = (),
-    start_s: float | None = None,
-    end_s: float | None = None,
-    last_s: float | None = None,
+    span: TimeRange = ANY_TIME,
     limit: int = 5,
     oldest_first: bool = False,
-    min_score: float | None = None,
     where: JsonValue = None,
-    during: Sequence[WhileCondition] = (),
+    during: Sequence[Sought] = (),
     frame_id: str | None = None,
     beside: str | None = None,
 ) -> Sightings:
-    """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
+    """Returns the newest `limit` sightings of what is sought, newest first.
 
     On a topic of texts that hold until the next one they are episodes (`insights.episodes`).
 
-    `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound the search.
-    With `oldest_first` all of that time is searched, and the oldest sightings are returned. A
+    With `oldest_first` all of the `span` is searched, and the oldest sightings are returned. A
     sighting has the `fields` (dot-paths) of its last message, and what the topic `beside` said
-    meanwhile. Detections with a score below `min_score` do not count.
+    meanwhile.
 
     With `where` only messages count that were received while the robot was there, with `during`
     while another topic met a condition. Robot positions are in the map, or in `frame_id`.
@@ -109,9 +102,9 @@ def find_matches(
         NoDataError: nothing is recorded, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
-    view, now, asked = open_search(memory, call, TimeRange(start_s, end_s, last_s))
+    view, now, asked = open_search(memory, call, span)
     require_recorded(view, asked)
-    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
+    topic, condition = sought.topic, condition_of(view, sought)
     window = clamped(view, asked)
     scope = Scope(view, window, where, during)
     other = None if beside is None else MeanwhileReader(view, beside)
@@ -131,7 +124,7 @@ def find_matches(
     notes = view.notes.sentences()
     if is_never:
         bounded = scope.is_bounded
-        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=bounded)
+        notes += notes_on_never(view, sought, condition, window, is_bounded=bounded)
     total = found.total if scope.since is None else None
     return Sightings(
         sightings,

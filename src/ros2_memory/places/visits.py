@@ -34,7 +34,7 @@ from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, View, open_search
+from ros2_memory.history.view import ANY_TIME, TimeRange, View, open_search
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     WHEREABOUTS,
@@ -76,15 +76,13 @@ def visits(
     where: JsonValue = None,
     frame_id: str | None = None,
     radius_m: float | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
+    span: TimeRange = ANY_TIME,
     limit: int = 10,
 ) -> Visits:
     """Returns the visits to a place, newest first; without a place, a summary for each named one.
 
     The place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map
-    (the default) or the frame of the poses. `start_s` and `end_s` (Unix seconds, inclusive) bound
-    the search.
+    (the default) or the frame of the poses. `span` bounds the search.
 
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the place is invalid, the frame
@@ -93,7 +91,7 @@ def visits(
         QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where, frame_id)
-    view, now, window = open_search(memory, call, TimeRange(start_s, end_s))
+    view, now, window = open_search(memory, call, span)
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)

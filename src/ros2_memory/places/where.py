@@ -28,7 +28,7 @@ from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
-from ros2_memory.history.conditions import condition_of, types_matching
+from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
@@ -47,7 +47,6 @@ from ros2_memory.places.pose_frames import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    # Not at runtime: pydantic, which `WhileCondition` is an argument of, takes no recursive type.
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import QuerySettings
@@ -267,16 +266,6 @@ def note_other_frame(
             )
 
 
-@dataclass(frozen=True, slots=True)
-class WhileCondition:
-    """A condition that the newest message of another topic must meet."""
-
-    topic: str
-    condition_type: str
-    value: JsonValue
-    field: str | None = None
-
-
 class Scope:
     """The times in which matches count: the robot is in a place, and all conditions hold.
 
@@ -295,7 +284,7 @@ class Scope:
         view: View,
         window: TimeWindow,
         where: JsonValue = None,
-        during: Sequence[WhileCondition] = (),
+        during: Sequence[Sought] = (),
     ) -> None:
         self._view = view
         self.window = window
@@ -418,10 +407,9 @@ class _ConditionStates:
     it is quick to ask about times from the newest to the oldest.
     """
 
-    def __init__(self, view: View, during: WhileCondition) -> None:
+    def __init__(self, view: View, during: Sought) -> None:
         self._view = view
-        topic, kind, value = during.topic, during.condition_type, during.value
-        condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
+        topic, condition = during.topic, condition_of(view, during)
         if types_matching(view, topic) == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)

@@ -21,7 +21,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.view import TimeRange, clamped, open_search
+from ros2_memory.history.view import ANY_TIME, TimeRange, clamped, open_search
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, UsualPlace
 from ros2_memory.things.instances import (
@@ -69,8 +69,7 @@ def find_things(
     *,
     where: JsonValue = None,
     near: JsonValue = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
+    span: TimeRange = ANY_TIME,
     min_score: float | None = None,
     limit: int = LIMIT,
 ) -> Things:
@@ -90,8 +89,8 @@ def find_things(
     region = None if where is None else parse_where(limits, where)
     nearness = None if near is None else parse_near(limits, near)
     lowest = limits.min_score if min_score is None else min_score
-    view, now, asked_window = open_search(memory, call, TimeRange(start_s, end_s))
-    searched = asked_window if end_s is not None else _rightly_dated(view, asked_window)
+    view, now, asked_window = open_search(memory, call, span)
+    searched = asked_window if span.end_s is not None else _rightly_dated(view, asked_window)
     require_recorded(view, searched)
     window = clamped(view, searched)
     if lowest > 1:
@@ -128,7 +127,7 @@ def find_things(
         found=frozenset(key for thing in found for key in thing.keys),
         vague=frozenset(thing.label for thing in found if known.estimate.is_vague(thing.rows)),
         window=window,
-        is_bounded=start_s is not None or end_s is not None,
+        is_bounded=span != ANY_TIME,
         has_region=region is not None or nearness is not None,
         min_score=f"min_score {lowest:g}{' (data.min_score)' if min_score is None else ''}",
         undecoded=undecoded,

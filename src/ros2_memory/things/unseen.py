@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import Vector3
+    from ros2_memory.history.conditions import Sought
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.things.instances import Instance, Move
     from ros2_memory.things.known import KnownThings
@@ -196,10 +197,9 @@ def _hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
 
 def notes_on_never(
     view: View,
-    topic: str,
+    sought: Sought,
     condition: Condition,
     window: TimeWindow,
-    min_score: float | None,
     *,
     is_bounded: bool = False,
 ) -> tuple[str, ...]:
@@ -207,12 +207,12 @@ def notes_on_never(
 
     `is_bounded`: the search did not count the matches at some times of the window.
     """
-    meant = () if is_bounded else _found_otherwise_spelt(view, topic, condition, window)
-    topics = matching_topics(view, topic)
+    meant = () if is_bounded else _found_otherwise_spelt(view, sought.topic, condition, window)
+    topics = matching_topics(view, sought.topic)
     heights = position_frames(view, topics) if condition.field == "position.z" else ()
     frames = {frame for _, of_topic in heights for frame in of_topic}
     return (
-        *_score_limit(condition, min_score),
+        *_score_limit(condition, sought.min_score),
         *_named_numbers(view, topics, condition),
         *(note for frame in sorted(frames) for note in axes_of(frame)),
         *meant,

@@ -38,8 +38,8 @@ from ros2_memory.core.timebase import (
     unix_from_text,
     window_end_s,
 )
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.places.where import WhileCondition
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""
@@ -156,7 +156,7 @@ def as_region(value: object) -> object:
     return parsed if isinstance(parsed, dict | list) else value
 
 
-def as_while(value: object) -> tuple[WhileCondition, ...]:
+def as_while(value: object) -> tuple[Sought, ...]:
     """Returns the conditions on other topics, which planners also send as JSON text."""
     parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
     conditions = parsed if isinstance(parsed, list) else [parsed]
@@ -167,20 +167,19 @@ def as_while(value: object) -> tuple[WhileCondition, ...]:
     return tuple(map(_while_condition, conditions))
 
 
-def _while_condition(parsed: object) -> WhileCondition:
+def _while_condition(parsed: object) -> Sought:
     if not isinstance(parsed, dict):
         raise ValueError("is not an object")  # noqa: TRY004 - pydantic reports ValueError alone
     unknown = sorted(str(name) for name in parsed.keys() - CONDITION_KEYS)
     if unknown:
         raise ValueError(f"has no {abbreviate(unknown[0])}; it has {', '.join(CONDITION_KEYS)}")
     try:
-        condition = ConditionArguments.model_validate(parsed)
+        asked = ConditionArguments.model_validate(parsed)
     except ValidationError as error:
         names = dict.fromkeys(str(fault["loc"][0]) for fault in error.errors(include_url=False))
         raise ValueError(f"needs a valid {' and '.join(names)}") from None
-    return WhileCondition(
-        condition.topic, condition.condition_type, condition.value, condition.field
-    )
+    # Detections of any score count.
+    return Sought(asked.topic, asked.condition_type, asked.value, asked.field, 0.0)
 
 
 def _as_hours(value: object) -> object:
@@ -382,6 +381,14 @@ class Arguments(BaseModel):
     # Few of them are needed by a program that asks one question: each is built when it is used.
     model_config = ConfigDict(frozen=True, defer_build=True)
 
+    def for_query(self) -> dict[str, object]:
+        """Returns the arguments of the query; those of a condition are one."""
+        given = dict(self)
+        if "condition_type" not in given:
+            return given
+        sought = Sought._make(given.pop(name) for name in Sought._fields)
+        return {"sought": sought, **given}
+
 
 class TimeArgument(Arguments):
     """The arguments that replace a placeholder of `Arguments`.
@@ -469,6 +476,27 @@ class Last(TimeArgument):
     last_s: Annotated[_Positive, Field(examples=[60], alias="seconds")]
 
 
+class Window(TimeArgument):
+    """A window of which either end may be open."""
+
+    replaces = "span"
+    text = ""
+    start_s: _Start = None
+    end_s: _End = None
+
+
+class LastOrWindow(TimeArgument):
+    """A window that ends now, or one of which either end may be open."""
+
+    replaces = "span"
+    text = ""
+    last_s: Annotated[_Positive, Field(description="Up to now.")] | None = Field(
+        default=None, alias="seconds"
+    )
+    start_s: _Start = None
+    end_s: _End = None
+
+
 class NoArguments(Arguments):
     """No arguments."""
 
@@ -476,8 +504,7 @@ class NoArguments(Arguments):
 class RecordedTimesArguments(Arguments):
     """The window in which gaps, silences and steps of the clock are listed."""
 
-    start_s: _Start = None
-    end_s: _End = None
+    span: TimeRange
 
 
 class TopicListArguments(Arguments):
@@ -556,7 +583,7 @@ class ValueWhenArguments(Arguments):
     """A condition on one topic, and another topic to read at the match."""
 
     value_topic: Annotated[_Name, Field(description="Topic to read then.", examples=["/odom"])]
-    condition_topic: _SearchTopic
+    topic: _SearchTopic = Field(alias="condition_topic")
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
@@ -652,8 +679,7 @@ class VisitsArguments(Arguments):
     x: _Coordinate | None = None
     y: _Coordinate | None = None
     where: _Where | None = None
-    start_s: _Start = None
-    end_s: _End = None
+    span: TimeRange
     frame_id: Annotated[_Name, Field(description="Of x, y; default: the map.")] | None = None
     radius_m: Annotated[_Positive, Field(description="m.")] | None = None
     limit: _Limit = 10
@@ -662,7 +688,7 @@ class VisitsArguments(Arguments):
 
 
 _While: TypeAlias = Annotated[
-    tuple[InstanceOf[WhileCondition], ...],
+    tuple[InstanceOf[Sought], ...],
     BeforeValidator(as_while),
     WithJsonSchema(
         {
@@ -680,11 +706,7 @@ class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
     fields: _Fields = ()
-    last_s: Annotated[_Positive, Field(description="Up to now.")] | None = Field(
-        default=None, alias="seconds"
-    )
-    start_s: _Start = None
-    end_s: _End = None
+    span: TimeRange
     oldest_first: Annotated[bool, Field(strict=True, description="With total.")] = False
     limit: _Limit = 5
     by: _ByInMatches | None = None
@@ -703,8 +725,7 @@ class ThingsArguments(Arguments):
     labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
     where: _WhereOfThings | None = None
     near: _Near | None = None
-    start_s: _Start = None
-    end_s: _End = None
+    span: TimeRange
     min_score: _MinScore | None = None
     limit: _Limit = 12
 

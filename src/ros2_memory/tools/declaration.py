@@ -318,22 +318,6 @@ class Tool:
         return self.describe()
 
 
-def _span_of(arguments: Mapping[str, object]) -> TimeRange:
-    """Returns the window of a call: its span, or its bounds where these are arguments."""
-    span = arguments.get("span")
-    if isinstance(span, TimeRange):
-        return span
-    names = ("start_s", "end_s", "last_s")
-    start, end, last = (cast("float | None", arguments.get(name)) for name in names)
-    return TimeRange(start, end, last)
-
-
-def _with_span(arguments: Mapping[str, object], span: TimeRange) -> dict[str, object]:
-    """Returns the arguments of a call with another window, however they state one."""
-    bounds = {"span": span, "start_s": span.start_s, "end_s": span.end_s, "last_s": None}
-    return {**arguments, **{name: bounds[name] for name in bounds if name in arguments}}
-
-
 @dataclass(frozen=True, slots=True)
 class ToolName:
     """One name of a query, and the arguments that replace its moment or span.
@@ -420,7 +404,7 @@ class ToolDeclaration:
         Raises:
             InvalidArgumentsError: they are refused.
         """
-        arguments = dict(signature.parse(given))
+        arguments = signature.parse(given).for_query()
         between = cast("tuple[time, time] | None", arguments.pop("between", None))
         query, chosen = self._choose_query(arguments)
         moment = chosen.get("moment")
@@ -432,12 +416,13 @@ class ToolDeclaration:
                 return cast("MomentAnswer", query(fixed, call, **{**chosen, "moment": moment}))
 
             def ask_in(fixed: Memory, span: TimeRange) -> OneAnswer:
-                return cast("OneAnswer", query(fixed, call, **_with_span(chosen, span)))
+                return cast("OneAnswer", query(fixed, call, **{**chosen, "span": span}))
 
             if isinstance(moment, AtTime) and moment.each:
                 return at_each(memory, moment.each, ask_at)
             if between is not None:
-                return in_each(memory, call, _span_of(chosen), between, ask_in)
+                span = cast("TimeRange", chosen["span"])
+                return in_each(memory, call, span, between, ask_in)
             return query(memory, call, **chosen)
 
         return ask

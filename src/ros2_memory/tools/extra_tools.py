@@ -14,6 +14,7 @@ from ros2_memory.places.visits import visits
 from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (
     CompareArguments,
+    LastOrWindow,
     MatchesArguments,
     MomentArguments,
     NoArguments,
@@ -23,11 +24,12 @@ from ros2_memory.tools.arguments import (
     ThingsArguments,
     TypeArguments,
     VisitsArguments,
+    Window,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 _SIGHTINGS = ToolDeclaration(
-    (ToolName("find_matches", "Sightings", drawn=True),),
+    (ToolName("find_matches", "Sightings", LastOrWindow, drawn=True),),
     "When, where, how often and how long a condition was true, newest first. "
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
@@ -61,7 +63,7 @@ _STATUS = ToolDeclaration(
     memory_status,
 )
 _VISITS = ToolDeclaration(
-    (ToolName("visits", "Visits", drawn=True),),
+    (ToolName("visits", "Visits", Window, drawn=True),),
     "When, how long, how often the robot was in a place (where, or near x, y), newest first, in "
     "{map_frame} if known, else {pose_topic}'s; without one, "
     "all named. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
@@ -73,7 +75,7 @@ _VISITS = ToolDeclaration(
     instead={"by": count_visits},
 )
 _THINGS = ToolDeclaration(
-    (ToolName("find_things", "Things", drawn=True),),
+    (ToolName("find_things", "Things", Window, drawn=True),),
     "Which things there are and where: how many chairs, what is in a place or near X, where X is, "
     "since when, where before, likely now; as of end. Reply: {{things: [{{label, place, in, "
     "first_seen, last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "

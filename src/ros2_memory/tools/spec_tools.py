@@ -27,6 +27,7 @@ from ros2_memory.tools.arguments import (
     TrajectoryArguments,
     TransformArguments,
     ValueWhenArguments,
+    Window,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
@@ -48,7 +49,7 @@ DECLARATIONS = (
         queries.list_recorded_topics,
     ),
     ToolDeclaration(
-        (ToolName("data_time_range", "Recorded times"),),
+        (ToolName("data_time_range", "Recorded times", Window),),
         "The recorded range; gaps, silences and steps of the clock, of all or a window. "
         "Reply: {{earliest, latest, now, gaps, ...}} or null.",
         RecordedTimesArguments,

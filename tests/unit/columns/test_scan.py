@@ -20,6 +20,7 @@ from ros2_memory.columns.stored import Letters
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import GoneError
 from ros2_memory.columns.zones import PartZones
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
@@ -43,7 +44,7 @@ def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
     tables = [rows.table for rows in scan(View(memory, Call()), "/chatter", EVERYTHING)]
     assert sum(map(len, tables)) == len(said)
     assert sum(table.memory_bytes for table in tables) < most
-    found = find_last_match(memory, Call(), "/chatter", "contains", "07a")
+    found = find_last_match(memory, Call(), Sought("/chatter", "contains", "07a"))
     assert (found.found and found.found.sample.time) == said[7].log_time
 
 

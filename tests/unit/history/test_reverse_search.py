@@ -21,6 +21,7 @@ from ros2_memory import queries
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.insights.fields import describe_type
@@ -180,15 +181,15 @@ def test_a_battery_that_stated_fractions_before_percent_is_noted(
 
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
-    question = (memory, Call(), "/battery_state")
+    battery_above = partial(Sought, "/battery_state", "above", field="percentage")
     searches: tuple[Callable[..., object], ...] = (queries.find_last_match, find_matches)
     for kind, search in itertools.product(("below", "above"), searches):
         with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
-            search(*question, kind, 20, field="percentage")
-    assert at(queries.find_last_match(*question, "above", 0.2, field="percentage")) == 0
+            search(memory, Call(), Sought("/battery_state", kind, 20, "percentage"))
+    assert at(queries.find_last_match(memory, Call(), battery_above(0.2))) == 0
     for unknown in (math.nan, -1.0):  # it states no charge, be it in percent or as a fraction
-        question = (remembered(tmp_path, [battery(T0, unknown)]), Call(), "/battery_state")
-        assert queries.find_last_match(*question, "above", 20, field="percentage").found is None
+        memory = remembered(tmp_path, [battery(T0, unknown)])
+        assert queries.find_last_match(memory, Call(), battery_above(20)).found is None
 
 
 def test_a_field_of_json_is_refused_with_what_to_ask_instead(tmp_path: Path) -> None:
@@ -289,10 +290,11 @@ def test_never_of_a_word_names_the_constant_that_has_it(
         "ask equals on the field of that number, such as state"
     )
     for topic in ("/winch", "/winch*"):
-        question = (memory, Call(), topic, kind)
-        assert queries.find_last_match(*question, word).notes == (note,)
-        assert find_matches(*question, word).notes == (note,)
-        assert queries.find_last_match(*question, "paying").notes == ()
+        sought = Sought(topic, kind, word)
+        assert queries.find_last_match(memory, Call(), sought).notes == (note,)
+        assert find_matches(memory, Call(), sought).notes == (note,)
+        other = Sought(topic, kind, "paying")
+        assert queries.find_last_match(memory, Call(), other).notes == ()
     if word == "hauling":
         with pytest.raises(InvalidArgumentsError, match=r"such as STATE_HAULING = 2$"):
             last(memory, kind, word, "/winch", field="state")
@@ -346,7 +348,9 @@ def last(
     topic: str = SCENE,
     field: str | None = None,
 ) -> Match:
-    return queries.find_last_match(memory, Call(), topic, condition_type, value, field=field)
+    return queries.find_last_match(
+        memory, Call(), Sought(topic, condition_type, value, field=field)
+    )
 
 
 def at(match: Match) -> int:
@@ -366,7 +370,9 @@ def test_a_bag_beyond_its_share_is_searched_by_its_columns(tmp_path: Path) -> No
             search = partial(last, each, "near_position", topic="/odom")
             assert search({"x": 0.0, "y": 0.0}).found is None
             assert search({"x": 5.0, "y": 5.0}).found is not None
-            runs = find_matches(each, Call(), "/odom", "above", 8.9, field="position.x", limit=99)
+            runs = find_matches(
+                each, Call(), Sought("/odom", "above", 8.9, field="position.x"), limit=99
+            )
             assert runs.total == sum(met for met, _ in itertools.groupby(x > 8.9 for x in xs))
     assert decode.call_count < 60
 

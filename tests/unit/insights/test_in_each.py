@@ -11,6 +11,7 @@ import pytest
 
 from ros2_memory.core.errors import NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import fields
@@ -138,9 +139,7 @@ def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder:
         if len(asked_days) > 1:
             raise QueryTimeoutError("out of time")
         topic, kind, value = HELLO.values()
-        return find_matches(
-            memory, Call(), topic, kind, value, start_s=span.start_s, end_s=span.end_s
-        )
+        return find_matches(memory, Call(), Sought(topic, kind, value), span=span)
 
     span = TimeRange(SPAN["start"], SPAN["end"])
     hours = (datetime.min.time().replace(23, 59), datetime.min.time().replace(0, 2))

@@ -18,11 +18,11 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.history import held_values
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.where import WhileCondition
 from ros2_memory.tools.replies import as_json
 from tests.support.bags import (
     McapLayout,
@@ -54,16 +54,16 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     seen, limits = [detections(BEGIN, ["cup"], score=0.2)], QuerySettings(min_score=0.5)
     memory = remembered(tmp_path, seen, limits=limits)
     note = "detections with a score below 0.5 do not count here, unless min_score is given"
-    asked = (memory, Call(), OBJECTS, "contains", "cup")
-    assert find_matches(*asked).notes == (note,)
-    assert find_matches(*asked, min_score=0.5).notes == ()
-    assert note in queries.find_last_match(*asked).notes
+    cup = Sought(OBJECTS, "contains", "cup")
+    assert find_matches(memory, Call(), cup).notes == (note,)
+    assert find_matches(memory, Call(), cup._replace(min_score=0.5)).notes == ()
+    assert note in queries.find_last_match(memory, Call(), cup).notes
 
 
 def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [detections(BEGIN, ["scissors"])])
     note = f'"the scissors" was not found, but "scissors" was, last at {T0:.6f}'
-    found = find_matches(memory, Call(), OBJECTS, "contains", "the scissors")
+    found = find_matches(memory, Call(), Sought(OBJECTS, "contains", "the scissors"))
     assert found.notes == (note,)
 
 
@@ -74,15 +74,18 @@ def test_never_names_the_spelling_of_a_label_that_was_found(
 ) -> None:
     memory = remembered(tmp_path, [detections(BEGIN, ["traffic_light"])])
     note = f'"{asked.lower()}" was not found, but "traffic_light" was, last at {T0:.6f}'
-    found = find_matches(memory, Call(), OBJECTS, condition_type, asked)
+    found = find_matches(memory, Call(), Sought(OBJECTS, condition_type, asked))
     assert found.total == 0
     assert found.notes == (note,)
-    assert note in queries.find_last_match(memory, Call(), OBJECTS, condition_type, asked).notes
+    assert (
+        note
+        in queries.find_last_match(memory, Call(), Sought(OBJECTS, condition_type, asked)).notes
+    )
 
 
 def test_never_names_a_label_with_spaces_that_was_asked_for_without(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [detections(BEGIN, ["traffic light"])])
-    found = find_matches(memory, Call(), OBJECTS, "equals", "traffic_light")
+    found = find_matches(memory, Call(), Sought(OBJECTS, "equals", "traffic_light"))
     note = f'"traffic_light" was not found, but "traffic light" was, last at {T0:.6f}'
     assert found.notes == (note,)
 
@@ -107,19 +110,20 @@ def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: 
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
     memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
     place: JsonValue = {"x": 1.0, "y": 2.0, "frame_id": "odom"}
-    asked = (memory, Call(), "/odom", "near_position")
-    assert len(find_matches(*asked, place).sightings) == 1
-    found = queries.find_last_match(*asked, place).found
+    near = partial(Sought, "/odom", "near_position")
+    assert len(find_matches(memory, Call(), near(place)).sightings) == 1
+    found = queries.find_last_match(memory, Call(), near(place)).found
     assert found is not None
     assert found.frame_id == "odom"
-    elsewhere = queries.find_last_match(*asked, {"x": 6.0, "y": 2.0})
+    elsewhere = queries.find_last_match(memory, Call(), near({"x": 6.0, "y": 2.0}))
     assert "in the frame of each message: odom" in elsewhere.notes[-1]
     there: JsonValue = {"x": 6.0, "y": 2.0, "frame_id": "map"}
-    during = WhileCondition("/odom", "near_position", there)
     for ask in (
-        lambda: find_matches(*asked, there),
-        lambda: queries.find_last_match(*asked, there),
-        lambda: find_matches(memory, Call(), "/odom", "contains", "x", during=(during,)),
+        lambda: find_matches(memory, Call(), near(there)),
+        lambda: queries.find_last_match(memory, Call(), near(there)),
+        lambda: find_matches(
+            memory, Call(), Sought("/odom", "contains", "x"), during=(near(there),)
+        ),
     ):
         with pytest.raises(InvalidArgumentsError, match=r'is "map".* is odom on /odom.*visits'):
             ask()
@@ -138,7 +142,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     poses = [odom(BEGIN + at * S, 0.5 * at) for at in range(3)]
     memory = remembered(tmp_path, [*placed, *seen, *poses])
     for frame_id in (None, "odom"):
-        answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
+        answer = find_matches(memory, Call(), Sought(OBJECTS, "contains", "cup"), frame_id=frame_id)
         [sighting] = answer.sightings
         assert sighting.last == late
         assert sighting.thing is not None
@@ -146,7 +150,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         assert "is in base_link" not in str(answer.notes)
     far = [detections(late + at * S, ["cup"]) for at in range(6, 8)]
     memory = remembered(tmp_path, [*placed, *poses, *far])
-    answer = find_matches(memory, Call(), OBJECTS, "contains", "cup")
+    answer = find_matches(memory, Call(), Sought(OBJECTS, "contains", "cup"))
     assert "no transform leads to map" in str(answer.notes)
 
 
@@ -167,7 +171,7 @@ def test_the_place_of_a_sighting_is_where_the_thing_was_at_the_stamp_of_its_mess
     shown = detections(BEGIN + shown_s * S, ["cup"], at=(3.0, 0.0, 0.0))
     seen = [replace(shown, log_time=BEGIN + at * S) for at in logged_s]
     memory = remembered(tmp_path, [*turning, *seen])
-    [sighting] = find_matches(memory, Call(), OBJECTS, "contains", "cup").sightings
+    [sighting] = find_matches(memory, Call(), Sought(OBJECTS, "contains", "cup")).sightings
     assert sighting.thing is not None
     assert sighting.thing.position[:2] == pytest.approx(place, abs=0.01)
     assert sighting.thing.frame_id == "map"
@@ -179,7 +183,7 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
 
     things = [seen("headphones", 0.4, 1.0), seen("phone", 0.8, 2.0), seen("mug", 0.9, 3.0)]
     memory = remembered(tmp_path, [text(BEGIN, json.dumps(things), topic="/seen")])
-    [sighting] = find_matches(memory, Call(), "/seen", "contains", "phone").sightings
+    [sighting] = find_matches(memory, Call(), Sought("/seen", "contains", "phone")).sightings
     assert sighting.thing is not None
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
@@ -235,11 +239,11 @@ def test_spells_whose_ends_are_known_count_where_there_is_no_time_to_look_for_al
     driven = [odom(at, float(at // S % 10)) for at in times]
     write_splits(tmp_path, [*driven, *(text(at + 1, "calm", topic="/mood") for at in times)])
     memory = memory_of(tmp_path)
-    calm = [WhileCondition("/mood", "equals", "calm")]
+    calm = [Sought("/mood", "equals", "calm")]
     answered: list[bool] = []
     for answer in running_out(
         lambda call: count_matches(
-            memory, call, "/odom", "above", 5.5, by="hour", field="position.x", during=calm
+            memory, call, Sought("/odom", "above", 5.5, field="position.x"), by="hour", during=calm
         )
     ):
         answered.append(answer is not None)
@@ -264,7 +268,7 @@ def test_a_damaged_bag_between_the_oldest_sightings_is_noted_where_time_is_over(
     spanned = 0
     for answer in running_out(
         lambda call: find_matches(
-            memory, call, "/bumper", "equals", value=True, oldest_first=True, limit=2
+            memory, call, Sought("/bumper", "equals", value=True), oldest_first=True, limit=2
         )
     ):
         if answer is not None and answer.sightings[0].first < BEGIN + 30 * S:
@@ -286,7 +290,9 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
-    slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True, limit=2)
+    slow = find_matches(
+        memory, Call(), Sought("/rosout", "contains", "lo"), oldest_first=True, limit=2
+    )
     assert [(each.first, each.messages) for each in slow.sightings] == [
         (BEGIN + S, 1),
         (BEGIN + 2 * S, 1),
@@ -356,7 +362,7 @@ def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -
     memory = remembered(tmp_path, said, recalls=recalls)
     for value, at in (("Кружка", 0), ('"big"', 2)):
         for condition_type in ("contains", "contains_word"):
-            found = find_matches(memory, Call(), "/seen", condition_type, value).sightings
+            found = find_matches(memory, Call(), Sought("/seen", condition_type, value)).sightings
             assert [sighting.first for sighting in found] == [BEGIN + at * S]
 
 

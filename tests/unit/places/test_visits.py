@@ -19,7 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import View
+from ros2_memory.history.view import TimeRange, View
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.visits import visits
 from tests.support.bags import (
@@ -147,10 +147,10 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
         plain = remembering(bag_dir, [odom(t, x, y) for t, x, y in poses], split_s=split_s)
         place: dict[str, Any] = {"radius_m": 1.0, "limit": 100}
         every = visits(plain, Call(), 0.0, 0.0, **place).visits
-        bounds: dict[str, Any] = {"start_s": float(start), "end_s": float(end)}
-        told = visits(plain, Call(), 0.0, 0.0, **place, **bounds)
+        bounds = TimeRange(float(start), float(end))
+        told = visits(plain, Call(), 0.0, 0.0, span=bounds, **place)
         stored = with_store(plain, bag_dir)
-        assert visits(stored, Call(), 0.0, 0.0, **place, **bounds) == told
+        assert visits(stored, Call(), 0.0, 0.0, span=bounds, **place) == told
         last = poses[-1][0]
         inside = [(each.arrived or 0, each.departed or last) for each in every]
         # Bounds in float seconds have a tolerance of a microsecond or two.

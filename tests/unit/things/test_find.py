@@ -23,6 +23,7 @@ from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.view import TimeRange
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known, synonyms, unseen
@@ -937,7 +938,7 @@ def test_of_a_window_before_what_was_compared_no_never_is_said(
     crowded, start_s = eight_bags(tmp_path), float(begin_of(0))
     for labels, seen in (((), THINGS[2:5]), (("thing 0",), ()), (("thing 7",), ())):
         found = find_things(
-            crowded, Call(Deadline.after(60)), labels, start_s=start_s, end_s=begin_of(5) - 1
+            crowded, Call(Deadline.after(60)), labels, span=TimeRange(start_s, begin_of(5) - 1)
         )
         assert {thing.label for thing in found.things} == {label for label, *_ in seen}
         assert not found.all_counted

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.reply import POSE_KEYS, TENTHS_OF_S, JsonObject, Scope, keys, render, rounded
+from ros2_memory.history.conditions import Sought
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import recap_before
 from ros2_memory.insights.recap import events_by_topic, recap
@@ -95,7 +96,8 @@ def sightings_shown(
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    view, window = open_span(memory, call, TimeRange(start_s, end_s))
+    span = TimeRange(start_s, end_s)
+    view, window = open_span(memory, call, span)
     key_of = Labels(memory.limits.labels).key
     spellings = [
         (topic, spelling)
@@ -108,17 +110,10 @@ def sightings_shown(
     notes: list[str] = []
     total: int | None = 0  # None when one of them is not known
     for topic, spelling in spellings:
-        sightings = find_matches(
-            memory,
-            call,
-            topic,
-            # The name of a class may be its number, which coordinates may equal.
-            "contains_word" if spelling.isdecimal() else "equals",
-            spelling,
-            start_s=start_s,
-            end_s=end_s,
-            limit=MOST_SIGHTINGS,
-        )
+        # The name of a class may be its number, which coordinates may equal.
+        kind = "contains_word" if spelling.isdecimal() else "equals"
+        sought = Sought(topic, kind, spelling)
+        sightings = find_matches(memory, call, sought, span=span, limit=MOST_SIGHTINGS)
         rendered = render(sightings, memory.index.bag_dir)["sightings"]
         if isinstance(rendered, list):
             rows += [{"topic": topic, **row} for row in rendered if isinstance(row, dict)]

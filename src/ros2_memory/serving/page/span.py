@@ -445,13 +445,7 @@ def _moments(memory: Memory, call: Call) -> Part:
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Part:
     """Returns the things that were seen in a window."""
     try:
-        answer = find_things(
-            memory,
-            call,
-            start_s=unix_from_ns(window.start),
-            end_s=unix_from_ns(window.stop - 1),
-            limit=MOST_THINGS,
-        )
+        answer = find_things(memory, call, span=TimeRange.over(window), limit=MOST_THINGS)
     except (NoDataError, InvalidArgumentsError) as error:
         return Part({"things": []}, (str(error),))
     things: list[JsonValue] = [_THING.render(thing, Scope()) for thing in answer.things]
