@@ -19,7 +19,7 @@ from ros2_memory.cli.output import (
 )
 from ros2_memory.config import Settings
 from ros2_memory.core.model import BagFile
-from ros2_memory.core.reply import JsonObject, Scope, shown
+from ros2_memory.core.reply import JsonObject, shown
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.no_data import nothing_here
@@ -62,7 +62,7 @@ def _print_nothing(memory: Memory) -> None:
 
 def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> JsonObject:
     """Returns the row that `list_recorded_topics` replies, with the rate and all notes."""
-    row = shown(topic, Scope())
+    row = shown(topic)
     if topic.undecodable:
         row["undecodable"] = topic.undecodable
     if topic.notes:

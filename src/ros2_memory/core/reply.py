@@ -319,8 +319,9 @@ class Keys:
         """The keys that stay in a short reply."""
         return replace(self, keys=tuple(key for key in self.keys if key.is_short))
 
-    def render(self, owner: object, scope: Scope) -> JsonObject:
-        """Returns the JSON of a result by these keys."""
+    def render(self, owner: object, scope: Scope | None = None) -> JsonObject:
+        """Returns the JSON of a result by these keys; without a scope, of one that needs none."""
+        scope = scope or Scope()
         if self.span is not None:
             first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
             now = getattr(owner, "now", scope.now)
@@ -383,7 +384,7 @@ def render(answer: object, bag_dir: Path, form: Keys | None = None) -> JsonObjec
     return with_notes(reply, [*getattr(answer, "notes", ()), *scope.notes])
 
 
-def shown(owner: object, scope: Scope, form: Keys | None = None) -> JsonObject:
+def shown(owner: object, scope: Scope | None = None, form: Keys | None = None) -> JsonObject:
     """Returns the JSON of a result; `form` replaces the keys that it declares."""
     return (form or cast("Declared", owner).reply).render(owner, scope)
 

@@ -22,7 +22,6 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.reply import (
     JsonObject,
     LocalTimes,
-    Scope,
     file_name,
     render,
     shown,
@@ -141,7 +140,7 @@ class Replies:
         If the list would be too long, the busiest topics come first, and the last row sums up the
         others: their first and last time and all their messages.
         """
-        text = to_json_text([robot | shown(row, Scope()) for row in rows])
+        text = to_json_text([robot | shown(row) for row in rows])
         if len(text) <= self.max_chars:
             return text
         busiest = sorted(rows, key=lambda row: -row.count)
@@ -155,7 +154,7 @@ class Replies:
                 max(row.last for row in rest),
                 sum(row.count for row in rest),
             )
-            return to_json_text([robot | shown(row, Scope()) for row in (*busiest[:most], last)])
+            return to_json_text([robot | shown(row) for row in (*busiest[:most], last)])
 
         fit = largest(0, len(rows) - 1, lambda most: len(text_of(most)) <= self.max_chars)
         return text_of(fit or 0)
@@ -206,7 +205,7 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
     """Returns an answer as a JSON value of any size; files are named relative to `bag_dir`."""
     match answer:
         case tuple():
-            return [shown(row, Scope()) for row in answer]
+            return [shown(row) for row in answer]
         case results.Match(found=None, notes=()):
             return None
         case results.AtEach():

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.reply import POSE_KEYS, TENTHS_OF_S, JsonObject, Scope, keys, render, rounded
+from ros2_memory.core.reply import (
+    PAIRS,
+    PLAIN,
+    POSE_KEYS,
+    TENTHS_OF_S,
+    JsonObject,
+    Scope,
+    an_object,
+    digits,
+    keys,
+    shown,
+)
 from ros2_memory.history.conditions import Sought
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import recap_before
@@ -16,7 +27,7 @@ from ros2_memory.things.labels import Labels
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Recap
+    from ros2_memory.results import Recap, Sightings
 
 AROUND_S: Final = 1.0
 """How long before and after a moment counts as seen at it: a detector reports once a second."""
@@ -26,6 +37,12 @@ _CHANGES_S: Final = 10.0
 """How long before a moment a change is shown."""
 _IN_VIEW: Final = " in view"
 _CHANGE: Final = keys("text", TENTHS_OF_S("before_s", "before"))
+_ROBOT: Final = keys(
+    an_object(POSE_KEYS)("robot"),
+    PLAIN("frame", "robot.frame_id"),
+    digits(2)("speed", "speed_mps"),
+    PAIRS("state"),
+)
 
 
 def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
@@ -46,11 +63,8 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
     changes = [*preceding.changes, *preceding.after]
     return {
         "t": at_s,
-        "robot": None if preceding.robot is None else POSE_KEYS.render(preceding.robot, Scope()),
-        "frame": None if preceding.robot is None else preceding.robot.frame_id,
-        "speed": None if preceding.speed_mps is None else rounded(preceding.speed_mps, 2),
-        "state": dict(preceding.state),
-        "changes": [_CHANGE.render(change, Scope()) for change in changes],
+        **_ROBOT.render(preceding),
+        "changes": [_CHANGE.render(change) for change in changes],
         "seen": _seen(around),
         "notes": [*dict.fromkeys([*preceding.notes, *around.notes])],
     }
@@ -70,9 +84,9 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
     return {
         "start": start_s,
         "end": end_s,
-        **SUMMARY.render(summary, Scope()),
+        **SUMMARY.render(summary),
         "seen": _seen(summary),
-        "events": [EVENT.render(event, Scope()) for event in others],
+        "events": [EVENT.render(event) for event in others],
         "notes": [*summary.notes],
     }
 
@@ -83,7 +97,7 @@ def _seen(summary: Recap) -> list[JsonValue]:
     for event in summary.events:
         label = event.text.removesuffix(_IN_VIEW)
         if event.kind == "thing" and label not in rows:
-            rows[label] = {**EVENT.render(event, Scope()), "label": label}
+            rows[label] = {**EVENT.render(event), "label": label}
     return [*rows.values()]
 
 
@@ -106,25 +120,21 @@ def sightings_shown(
         for spelling in sorted({label, *events.visible.labels})
         if key_of(spelling) == key_of(label)
     ]
-    rows: list[JsonObject] = []
-    notes: list[str] = []
-    total: int | None = 0  # None when one of them is not known
+    answers: list[Sightings] = []
     for topic, spelling in spellings:
         # The name of a class may be its number, which coordinates may equal.
         kind = "contains_word" if spelling.isdecimal() else "equals"
         sought = Sought(topic, kind, spelling)
-        sightings = find_matches(memory, call, sought, span=span, limit=MOST_SIGHTINGS)
-        rendered = render(sightings, memory.index.bag_dir)["sightings"]
-        if isinstance(rendered, list):
-            rows += [{"topic": topic, **row} for row in rendered if isinstance(row, dict)]
-        total = None if total is None or sightings.total is None else total + sightings.total
-        notes += sightings.notes
-    rows.sort(key=lambda row: float(str(row.get("last_seen") or 0.0)), reverse=True)
+        answers.append(find_matches(memory, call, sought, span=span, limit=MOST_SIGHTINGS))
+    found = [sighting for answer in answers for sighting in answer.sightings]
+    found.sort(key=lambda sighting: sighting.last, reverse=True)
+    scope = Scope(now=max((answer.now for answer in answers), default=0))
+    totals = [answer.total for answer in answers if answer.total is not None]
     return {
         "label": label,
         "start": start_s,
         "end": end_s,
-        "sightings": [*rows[:MOST_SIGHTINGS]],
-        "total": total,
-        "notes": [*dict.fromkeys(notes)],
+        "sightings": [shown(sighting, scope) for sighting in found[:MOST_SIGHTINGS]],
+        "total": sum(totals) if len(totals) == len(answers) else None,
+        "notes": [*dict.fromkeys(note for answer in answers for note in answer.notes)],
     }

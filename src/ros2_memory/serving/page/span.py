@@ -27,7 +27,6 @@ from ros2_memory.core.reply import (
     PLAIN,
     TENTHS_OF_S,
     JsonObject,
-    Scope,
     degrees,
     digits,
     keys,
@@ -427,7 +426,7 @@ def _events(memory: Memory, call: Call, window: TimeWindow) -> Part:
     summary = recap(
         memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
     )
-    shown = {**SUMMARY.render(summary, Scope()), **_ALL_EVENTS.render(summary, Scope())}
+    shown = {**SUMMARY.render(summary), **_ALL_EVENTS.render(summary)}
     return Part({**shown, "events_since": _start_s(window)}, summary.notes)
 
 
@@ -437,9 +436,7 @@ def _moments(memory: Memory, call: Call) -> Part:
         stored = list_moments(memory, call)
     except EpisodicError as error:
         return Part({"moments": []}, (str(error),))
-    return Part(
-        {"moments": [_MOMENT.render(saved, Scope()) for saved in stored.moments]}, stored.notes
-    )
+    return Part({"moments": [_MOMENT.render(saved) for saved in stored.moments]}, stored.notes)
 
 
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Part:
@@ -448,5 +445,5 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Part:
         answer = find_things(memory, call, span=TimeRange.over(window), limit=MOST_THINGS)
     except (NoDataError, InvalidArgumentsError) as error:
         return Part({"things": []}, (str(error),))
-    things: list[JsonValue] = [_THING.render(thing, Scope()) for thing in answer.things]
+    things: list[JsonValue] = [_THING.render(thing) for thing in answer.things]
     return Part({"things": things, "things_total": answer.total}, answer.notes)
