@@ -236,9 +236,8 @@ def _json_or(text: str, otherwise: str | None) -> JsonValue:
 
 def _argument_names(tool: Tool) -> list[str]:
     """Returns the names of a tool's arguments; optional ones end in `?`."""
-    required = tool.schema.get("required")
-    names = required if isinstance(required, list) else []
-    return [name if name in names else f"{name}?" for name in tool.arguments]
+    required = tool.described.required
+    return [name if name in required else f"{name}?" for name in tool.arguments]
 
 
 def _print_help(name: str) -> None:

@@ -38,6 +38,7 @@ from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, robots_clause
 from ros2_memory.places.where import has_coordinates
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings, ValueWhen
 from ros2_memory.tools.arguments import as_region, as_while
+from ros2_memory.tools.declaration import Described
 from ros2_memory.tools.replies import ROBOT_NAME, as_json
 
 T = TypeVar("T")
@@ -98,8 +99,8 @@ def fleet_tools(
     )
 
 
-def _describe(tool: Tool) -> tuple[str, JsonObject]:
-    """Returns a tool's description with the shape of replies for all robots, and its schema."""
+def _describe(tool: Tool) -> Described:
+    """Returns what planners read of a tool, with the shape of replies for all robots."""
     text, needs = tool.description, "Its name."
     if tool.name in TABLE_FOR_ALL:
         needs = "Its name; without it, or with several (a, b), by of all."
@@ -113,7 +114,7 @@ def _describe(tool: Tool) -> tuple[str, JsonObject]:
             shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
         text = f"{text} Of all robots: {shape}."
     argument: JsonObject = {"type": "string", "description": needs}
-    return text, {**tool.schema, "properties": {ROBOT: argument, **tool.arguments}}
+    return Described(text, {ROBOT: argument, **tool.arguments}, tool.described.required)
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,10 +51,8 @@ LONGEST_TOKEN: Final = 1024
 LOG_INTERVAL_S: Final = 60.0
 """Wrong tokens are logged at most this often: guessing must not fill the disk with log events."""
 
-_ROBOTS: Final = "ros2_memory.robots"
-"""The key in the scope of a request: the robots that its token is for; absent for all robots."""
-_ADMITTED: Final = "ros2_memory.admitted"
-"""The key in the state of a request, which its connection and `/health` can read."""
+_ACCESS: Final = "ros2_memory.access"
+"""The key in the state of an admitted request, which its connection and `/health` can read."""
 _SAME_SITE: Final = frozenset({"same-origin", "none"})
 """Values of Sec-Fetch-Site for a page of this server, or no page at all."""
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
@@ -77,27 +75,22 @@ _HOST: Final = re.compile(r"(?:([A-Za-z0-9._-]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]*
 log = get_logger(__name__)
 
 
-def admit(scope: Scope) -> None:
-    """Marks a request as admitted, for its connection."""
-    scope.setdefault("state", {})[_ADMITTED] = True
-
-
-def is_admitted(scope: Mapping[str, object]) -> bool:
-    """Returns whether a request was admitted."""
-    state = scope.get("state")
-    return isinstance(state, dict) and state.get(_ADMITTED) is True
-
-
-def robots_of(scope: Mapping[str, object]) -> frozenset[str] | None:
-    """Returns the robots that the token of a request is for; None for all."""
-    robots = scope.get(_ROBOTS)
-    return robots if isinstance(robots, frozenset) else None
-
-
-class _Access(NamedTuple):
+class Access(NamedTuple):
     """What a token is for: questions about some robots, or everything where `robots` is None."""
 
-    robots: frozenset[str] | None
+    robots: frozenset[str] | None = None
+
+
+def admit(scope: Scope, access: Access) -> None:
+    """Marks a request as admitted, for its connection."""
+    scope.setdefault("state", {})[_ACCESS] = access
+
+
+def access_of(scope: Mapping[str, object]) -> Access | None:
+    """Returns what a request was admitted to; None if it was not."""
+    state = scope.get("state")
+    access = state.get(_ACCESS) if isinstance(state, dict) else None
+    return access if isinstance(access, Access) else None
 
 
 class TokenGate:
@@ -127,7 +120,7 @@ class TokenGate:
         if token is not None:
             tokens[token] = None
         self._access_by_digest = {
-            _digest(text.encode("ascii")): _Access(robots) for text, robots in tokens.items()
+            _digest(text.encode("ascii")): Access(robots) for text, robots in tokens.items()
         }
         self._refusals = LogThrottle(monotonic, LOG_INTERVAL_S)
 
@@ -144,16 +137,13 @@ class TokenGate:
             if not is_health or given:
                 self._log_refused(scope, is_wrong=bool(given))
                 app = _unauthorized(is_wrong=bool(given), speaks_mcp=path == MCP_PATH)
-        elif access.robots is None:
-            admit(scope)
-        elif path.startswith(_QUESTIONS):
-            admit(scope)
-            scope = {**scope, _ROBOTS: access.robots}
+        elif access.robots is None or path.startswith(_QUESTIONS):
+            admit(scope, access)
         elif not is_health:
             app = _FORBIDDEN
         await app(scope, receive, send)
 
-    def _access(self, header: bytes) -> _Access | None:
+    def _access(self, header: bytes) -> Access | None:
         """Returns what the token in an Authorization header is for; None if it is not known."""
         scheme, token = header[: len(_SCHEME)].lower(), header[len(_SCHEME) :].strip(b" ")
         digest = _digest(token)
@@ -238,7 +228,7 @@ class ForgeryGuard:
                 log.warning("request_refused", reason=refusal.reason, refused=refused)
             app = PlainTextResponse(f"{refusal.reply}\n", refusal.status)
         elif self._admits and scope["type"] == "http":
-            admit(scope)
+            admit(scope, Access())
         await app(scope, receive, send)
 
     def _refusal(self, scope: Scope) -> _Refusal | None:

@@ -27,7 +27,7 @@ from starlette.responses import PlainTextResponse
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ros2_memory.core.logging_setup import LogThrottle, get_logger
-from ros2_memory.serving.auth import is_admitted
+from ros2_memory.serving.auth import access_of
 
 if TYPE_CHECKING:
     import asyncio
@@ -115,7 +115,7 @@ class BoundedConnection(H11Protocol):
         """Returns whether no request on it was admitted so far."""
         if self._is_admitted:  # an earlier request was
             return False
-        return not self._has_begun() or not is_admitted(self.scope)
+        return not self._has_begun() or access_of(self.scope) is None
 
     def __init__(
         self,

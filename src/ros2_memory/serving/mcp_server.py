@@ -34,7 +34,7 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
-from ros2_memory.serving.auth import robots_of
+from ros2_memory.serving.auth import access_of
 from ros2_memory.serving.page import joined
 from ros2_memory.serving.stdio import stdio_messages
 from ros2_memory.tools.instructions import prompt
@@ -323,7 +323,8 @@ def _client(request: Request | None) -> Hashable:
 
 def _robots(request: Request | None) -> frozenset[str] | None:
     """Returns the robots that the token of a request is for; None for all."""
-    return None if request is None else robots_of(request.scope)
+    access = None if request is None else access_of(request.scope)
+    return None if access is None else access.robots
 
 
 def _is_page(request: Request | None) -> bool:

@@ -24,7 +24,7 @@ from ros2_memory.serving.auth import (
     RECORDING_PATH,
     ForgeryGuard,
     TokenGate,
-    is_admitted,
+    access_of,
 )
 from ros2_memory.serving.connection_limits import RequestLimits
 from ros2_memory.serving.page import Page
@@ -141,10 +141,13 @@ def _health_routes(health: Callable[[], Awaitable[JsonObject]]) -> list[Route]:
     async def show_health(request: Request) -> JSONResponse:
         report = await health()
         # Enough for a monitor that only watches that the server is up.
-        return JSONResponse(report if is_admitted(request.scope) else {"status": report["status"]})
+        is_admitted = access_of(request.scope) is not None
+        return JSONResponse(report if is_admitted else {"status": report["status"]})
 
     async def show_recording(request: Request) -> JSONResponse:
-        return _recording_response(await health(), shows_details=is_admitted(request.scope))
+        return _recording_response(
+            await health(), shows_details=access_of(request.scope) is not None
+        )
 
     return [
         Route(HEALTH_PATH, show_health, methods=["GET"]),

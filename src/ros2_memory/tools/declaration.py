@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 from pydantic import ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -25,7 +25,7 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import time
 
     from pydantic_core.core_schema import NullableSchema
@@ -102,22 +102,21 @@ class Signature:
             if name in required
         }
 
-    def json_schema(self) -> JsonObject:
-        """Returns the schema that `tools/list` shows: flat, without empty defaults.
-
-        It does not forbid other arguments: the reply to an unknown one names similar arguments.
-        """
-        properties: JsonObject = {}
+    @property
+    def arguments(self) -> dict[str, JsonObject]:
+        """Returns the schema of each argument as `tools/list` shows it, without empty defaults."""
+        arguments: dict[str, JsonObject] = {}
         for name, schema in self._properties.items():
             shown: JsonObject = {key: item for key, item in schema.items() if key != "examples"}
             if shown.get("default") in (None, []):
                 shown.pop("default", None)
-            properties[name] = _with_plain_times(shown) if self.plain_times else shown
-        whole: JsonObject = {"type": "object", "properties": properties}
-        required = [*self._required, *(self._either if self.plain_times else ())]
-        if required:
-            whole["required"] = [*required]
-        return whole
+            arguments[name] = _with_plain_times(shown) if self.plain_times else shown
+        return arguments
+
+    @property
+    def required(self) -> list[str]:
+        """Returns the arguments that `tools/list` shows as required."""
+        return [*self._required, *(self._either if self.plain_times else ())]
 
     def parse(self, given: Mapping[str, object]) -> Arguments:
         """Returns the checked arguments. A null for an optional argument counts as not given.
@@ -273,6 +272,20 @@ Query: TypeAlias = "Callable[..., Answer]"  # type: ignore[explicit-any]
 """A function of a memory, a call, and the fields of its arguments as keywords; a test checks it."""
 
 
+class Described(NamedTuple):
+    """What planners read of a tool.
+
+    Attributes:
+        text: from which they learn what it answers.
+        arguments: the JSON schema of each argument.
+        required: the arguments that must be given.
+    """
+
+    text: str
+    arguments: Mapping[str, JsonObject]
+    required: Sequence[str]
+
+
 @dataclass(frozen=True)
 class Tool:
     """One tool as clients see it.
@@ -280,7 +293,7 @@ class Tool:
     Attributes:
         name: of the tool.
         title: its name for people.
-        describe: returns the description and the JSON schema of the arguments.
+        describe: returns what planners read.
         blocking: whether it may take long.
         question: checks the arguments of a call and binds them to the query.
         writes: whether it changes what is stored.
@@ -289,7 +302,7 @@ class Tool:
 
     name: str
     title: str
-    describe: Callable[[], tuple[str, JsonObject]]
+    describe: Callable[[], Described]
     blocking: bool
     question: Callable[[Mapping[str, object]], Question]
     writes: bool = False
@@ -298,23 +311,27 @@ class Tool:
     @property
     def description(self) -> str:
         """Returns the text from which planners learn what the tool answers."""
-        return self._described[0]
+        return self.described.text
+
+    @property
+    def arguments(self) -> Mapping[str, JsonObject]:
+        """Returns the JSON schema of each argument."""
+        return self.described.arguments
 
     @property
     def schema(self) -> JsonObject:
-        """Returns the JSON schema of the arguments."""
-        return self._described[1]
+        """Returns the JSON schema of all arguments, as `tools/list` shows it.
 
-    @property
-    def arguments(self) -> dict[str, JsonObject]:
-        """Returns the JSON schema of each argument."""
-        properties = self.schema["properties"]
-        named = properties.items() if isinstance(properties, dict) else ()
-        return {name: schema for name, schema in named if isinstance(schema, dict)}
+        It does not forbid others: the reply to an unknown one names similar arguments.
+        """
+        schema: JsonObject = {"type": "object", "properties": {**self.arguments}}
+        if required := self.described.required:
+            schema["required"] = [*required]
+        return schema
 
     @cached_property
-    def _described(self) -> tuple[str, JsonObject]:
-        # Made when it is asked for: 20 ms for all tools, of which a program may call one.
+    def described(self) -> Described:
+        """What planners read, made when it is first asked for: 20 ms for all tools."""
         return self.describe()
 
 
@@ -378,8 +395,8 @@ class ToolDeclaration:
 
     def _compose_description(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
-    ) -> tuple[str, JsonObject]:
-        """Returns the description and schema of a name; in full for the first name."""
+    ) -> Described:
+        """Returns what planners read of a name; in full for the first name."""
         first, when = self.names[0], name.when
         if name is first or when is None:
             text = self.description.format(when=when.text if when else "", **defaults)
@@ -389,14 +406,11 @@ class ToolDeclaration:
             text = f"Blocking. {text}"
         if self.shows_example and name is first:
             text = f"{text} Example: {to_json_text(signature.example)}"
-        schema = signature.json_schema()
-        properties = schema["properties"]
-        if name is not first and isinstance(properties, dict):
-            shared = Signature(self.arguments).json_schema()["properties"]
-            for argument, described in properties.items():
-                if isinstance(described, dict) and isinstance(shared, dict) and argument in shared:
-                    described.pop("description", None)
-        return text, schema
+        arguments = signature.arguments
+        if name is not first:
+            for argument in arguments.keys() & Signature(self.arguments).arguments:
+                arguments[argument].pop("description", None)
+        return Described(text, arguments, signature.required)
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         """Checks the arguments of a call, and returns its question, which reads the clock once.

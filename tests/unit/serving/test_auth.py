@@ -23,8 +23,8 @@ from ros2_memory.serving.auth import (
     LONGEST_TOKEN,
     SHORTEST_TOKEN,
     TokenGate,
+    access_of,
     api_token,
-    is_admitted,
     limited_tokens,
     take_token,
 )
@@ -40,7 +40,7 @@ class Inside:
         self.seen: list[tuple[str, object]] = []
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        self.seen.append((scope["type"], is_admitted(scope)))
+        self.seen.append((scope["type"], access_of(scope) is not None))
         if scope["type"] == "http":
             await PlainTextResponse("inside")(scope, receive, send)
 

@@ -17,7 +17,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
-from ros2_memory.serving.auth import admit
+from ros2_memory.serving.auth import Access, admit
 from ros2_memory.serving.connection_limits import MAX_BODY_BYTES, RequestLimits
 from ros2_memory.serving.dispatch import MAX_DEPTH, excess_in_arguments
 from tests.support.processes import PATIENCE_S, listening
@@ -48,7 +48,7 @@ class App:
             self.under_way -= 1
 
     async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
-        admit(scope)
+        admit(scope, Access())
         more = scope["method"] == "POST" and scope["path"] != "/early"
         while more:
             message = await receive()

@@ -33,7 +33,7 @@ from ros2_memory.results import Answer
 from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
 from ros2_memory.serving.fair_queue import MOST_WAITING, FairQueue
 from ros2_memory.serving.mcp_server import EpisodicServer
-from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.declaration import Described, Tool
 from ros2_memory.tools.replies import Replies, Reply
 
 NOBODY = cast("Memory", SimpleNamespace(large=LargeReads()))
@@ -46,8 +46,8 @@ def tool(name: str, ask: Callable[[Call], Answer], *, blocking: bool = False) ->
             raise InvalidArgumentsError("bad was given")
         return lambda _memory, call: ask(call)
 
-    schema: dict[str, Any] = {"type": "object", "properties": {}}
-    return Tool(name, name.title(), lambda: (f"What {name} does.", schema), blocking, question)
+    described = Described(f"What {name} does.", {}, ())
+    return Tool(name, name.title(), lambda: described, blocking, question)
 
 
 def value(shown: Any) -> results.TopicValue:
