@@ -58,9 +58,6 @@ if TYPE_CHECKING:
 _EXACT_BELOW: Final = 2**53
 _ROUNDING: Final = 1e-9
 """How much a distance that numpy computes may differ, relative to the tolerance; far too much."""
-_SHORT: Final = 200
-_MOST_DECIDED: Final = 4_096
-"""So many texts are remembered with whether they pass."""
 _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 
@@ -234,7 +231,7 @@ def _tests(condition: Condition, value: Node) -> list[_Test]:
         # Elements of lists have no name of their own.
         elements = [] if field is None else leaves_of(target, in_objects=False)
         for leaf in leaves:
-            leaf_test = _LeafTest(test, leaf, leaf in elements, condition.least_score, {})
+            leaf_test = _LeafTest(test, leaf, leaf in elements, condition.least_score)
             if leaf_test.is_needed:
                 tests.append(leaf_test)
     return tests
@@ -248,14 +245,12 @@ class _LeafTest(NamedTuple):
         leaf: what is tested.
         is_element: whether the field leads to the leaf, or to the list that it is an element of.
         least_score: detections in JSON with a lower score are left out.
-        decided: remembers which texts pass: many parts have the same ones.
     """
 
     test: Contains | Equals | Beyond
     leaf: Leaf
     is_element: bool
     least_score: float
-    decided: dict[str, bool]
 
     @property
     def numbers(self) -> tuple[int | float, ...]:
@@ -326,11 +321,7 @@ class _LeafTest(NamedTuple):
     def _passing_texts(self, values: Values) -> TruthValues:
         may_pass = values.letters(self.leaf, self._folded or "")
         if may_pass is None:
-            texts = values.texts(self.leaf)
-            flags = [*map(self.decided.get, texts.words)]
-            if None in flags:  # else no call is needed for each
-                flags = [*map(self._passes_text, texts.words)]
-            return TruthValues.known(np.array(flags, np.bool_)[texts.codes])
+            return TruthValues.known(values.texts(self.leaf).are(self._passes_text))
         is_one_word = isinstance(self.test, Contains) and self.test.is_one_word
         if not may_pass.any() or (is_one_word and not self.leaf.json_depth):
             return TruthValues.known(may_pass)
@@ -344,15 +335,11 @@ class _LeafTest(NamedTuple):
         return TruthValues.known(passes[texts.codes])
 
     def _passes_text(self, word: str) -> bool:
-        passes = self.decided.get(word)
-        if passes is None:
-            depth = self.leaf.json_depth
-            is_json = depth and looks_like_json(word)
-            counted = str(without_low_scores(word, self.least_score, depth)) if is_json else word
-            passes = self.passes(counted)
-            if len(word) <= _SHORT and len(self.decided) < _MOST_DECIDED:
-                self.decided[word] = passes
-        return passes
+        depth = self.leaf.json_depth
+        is_json = depth and looks_like_json(word)
+        return self.passes(
+            str(without_low_scores(word, self.least_score, depth)) if is_json else word
+        )
 
     def _passing_numbers(self, numbers: LeafNumbers) -> TruthValues:
         column, errors, exactly = numbers
