@@ -32,7 +32,6 @@ from zlib import crc32
 from pydantic import Field, TypeAdapter, ValidationError
 
 from ros2_memory.bag_dir.durable_write import (
-    MAX_SMALL_FILE,
     append_durably,
     flush,
     locked,
@@ -56,7 +55,7 @@ READABLE: Final = 0o644
 """Permissions of a file that the other program reads; it may run as another user."""
 
 MOST_BYTES: Final = 64 << 20
-"""The size limit of a log, and of a document that grows with the number of bags or messages."""
+"""The size limit of a log, and of a document: it grows with the number of bags or messages."""
 _FORMAT: Final = 1  # of each document
 _SURROGATE: Final = re.compile(r"\\ud[89a-f]", re.IGNORECASE)
 _CHECK: Final = b', "crc32": "'
@@ -75,8 +74,28 @@ class Line(NamedTuple, Generic[_T]):
 
 
 @dataclass(eq=False, repr=False)
-class JsonLog(Generic[_T]):
-    """A log in the bag directory, whose rows are of one dataclass.
+class _JsonFile(Generic[_T]):
+    """A file in the bag directory with one value of a dataclass, or many."""
+
+    name: str
+    content: type[_T]
+    _: KW_ONLY
+    most_bytes: int = MOST_BYTES
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files never exist
+        return TypeAdapter(self.content)
+
+    def _replace(self, bag_dir: Path, text: str, mode: int | None = None) -> None:
+        target = bag_dir / self.name
+        directories.make(bag_dir, target.parent)
+        write_durably(target, text, mode=mode)
+        give_to_owner(target, bag_dir)
+
+
+@dataclass(eq=False, repr=False)
+class JsonLog(_JsonFile[_T]):
+    """A log, whose rows are of one dataclass.
 
     Args:
         most_bytes: only the end of a longer file is read.
@@ -86,18 +105,10 @@ class JsonLog(Generic[_T]):
         current: `rows`, cached until the file changes; returns None instead of raising.
     """
 
-    name: str
-    row: type[_T]
-    _: KW_ONLY
-    most_bytes: int = MOST_BYTES
     is_brief: bool = False
 
     def __post_init__(self) -> None:
         self.current = until_changed(self.name)(self.rows)
-
-    @cached_property
-    def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files never exist
-        return TypeAdapter(self.row)
 
     def lines(self, bag_dir: Path) -> Iterator[Line[_T]]:
         """Yields the lines that are not empty.
@@ -195,34 +206,19 @@ class JsonLog(Generic[_T]):
         Raises:
             OSError: the file cannot be written; the old one remains.
         """
-        target = bag_dir / self.name
-        directories.make(bag_dir, target.parent)
-        write_durably(target, self.text(rows))
-        give_to_owner(target, bag_dir)
+        self._replace(bag_dir, self.text(rows))
 
 
 @dataclass(eq=False, repr=False)
-class JsonDocument(Generic[_T]):
-    """A document in the bag directory: one value of a dataclass.
-
-    Args:
-        most_bytes: a longer file is not read.
+class JsonDocument(_JsonFile[_T]):
+    """A document: one value of a dataclass. A file longer than `most_bytes` is not read.
 
     Attributes:
         current: `read`, cached until the file changes; returns None instead of raising.
     """
 
-    name: str
-    content: type[_T]
-    _: KW_ONLY
-    most_bytes: int = MAX_SMALL_FILE
-
     def __post_init__(self) -> None:
         self.current = until_changed(self.name)(self.read)
-
-    @cached_property
-    def _adapter(self) -> TypeAdapter[_T]:
-        return TypeAdapter(self.content)
 
     def read(self, bag_dir: Path) -> _T | None:
         """Returns the value; None if there is no file.
@@ -243,12 +239,10 @@ class JsonDocument(Generic[_T]):
         Raises:
             OSError: the file cannot be written; the old one remains.
         """
-        target = bag_dir / self.name
-        directories.make(bag_dir, target.parent)
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
         # ASCII with escapes: a path that is not UTF-8 has lone surrogates.
         text = json.dumps(content, separators=(",", ":"))
-        write_durably(target, text, mode=READABLE)
+        self._replace(bag_dir, text, READABLE)
 
     def remove(self, bag_dir: Path) -> None:
         """Removes the file durably.

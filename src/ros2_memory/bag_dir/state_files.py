@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAli
 from pydantic import Field, StrictBool
 
 from ros2_memory.bag_dir.json_files import (
-    MOST_BYTES,
     Count,
     Int64,
     JsonDocument,
@@ -47,6 +46,7 @@ from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
     LEAVING_FILE,
     LOST_FILE,
+    MEMORY_FOLDER,
     RECORDED_FILE,
     SCREENED_FILE,
     SHIPPED_FILE,
@@ -296,11 +296,12 @@ def _by_recording(rows: Iterable[Deleted]) -> Mapping[str, Deleted]:
     for row in rows:
         files[row.recording] |= dict.fromkeys(row.files)
         spans[row.recording] += row.spans
-    by_recording: dict[str, Deleted] = {}
-    for name, names_of_files in files.items():
-        joined = united(spans[name], _APART_NS if name else _TOUCHING_NS)
-        by_recording[name] = Deleted(name, tuple(names_of_files), tuple(joined))
-    return by_recording
+    return {
+        name: Deleted(
+            name, (*of_name,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),)
+        )
+        for name, of_name in files.items()
+    }
 
 
 @until_changed(DELETED_FILE)
@@ -338,7 +339,7 @@ class Superseded:
     bags: dict[str, str] = field(default_factory=dict)
 
 
-SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded, most_bytes=MOST_BYTES)
+SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded)
 
 
 def read_superseded(bag_dir: Path) -> Superseded:
@@ -403,7 +404,7 @@ class Thinned:
         )
 
 
-THINNED: Final = JsonDocument(THINNED_FILE, Thinned, most_bytes=MOST_BYTES)
+THINNED: Final = JsonDocument(THINNED_FILE, Thinned)
 
 
 def read_thinned(bag_dir: Path) -> Thinned:
@@ -425,9 +426,9 @@ LEAVING: Final = JsonDocument(LEAVING_FILE, Leaving)
 
 
 def describe_leaving(bag_dir: Path) -> str | None:
-    """Returns a sentence on when `memory/` is deleted; None if it stays."""
+    """Returns a sentence on when `memory/` is deleted; None if it stays, or is not there."""
     leaving = LEAVING.current(bag_dir)
-    if leaving is None:
+    if leaving is None or not (bag_dir / MEMORY_FOLDER).is_dir():
         return None
     return (
         f"memory/ is deleted once the recorder has run for {leaving.left_s / 3600:.1f} h more, "
@@ -501,10 +502,10 @@ def _shipped_sizes(bag_dir: Path) -> Mapping[str, int]:
 def unshipped(bag_dir: Path, bags: Iterable[tuple[str, int]]) -> frozenset[str]:
     """Returns the paths of bags that are in no lake; all of them if receipts cannot be read.
 
-    `bags` are paths below the bag directory, and sizes in bytes.
+    `bags` are paths in the bag directory, and sizes in bytes.
     """
-    sizes = _shipped_sizes(bag_dir) or {}
-    return frozenset(path for path, size in bags if sizes.get(path) != size)
+    sizes, root = _shipped_sizes(bag_dir) or {}, f"{bag_dir}/"
+    return frozenset(path for path, size in bags if sizes.get(path.removeprefix(root)) != size)
 
 
 def is_shipped(receipts: Mapping[str, Receipt], bag: str, size: int) -> bool:
@@ -613,7 +614,7 @@ class Erasure:
         return self.window_of(topic, log_time, publish_time) is not None
 
 
-ERASING: Final = JsonDocument(ERASING_FILE, Erasure, most_bytes=MOST_BYTES)
+ERASING: Final = JsonDocument(ERASING_FILE, Erasure)
 
 # screened.json
 
@@ -722,7 +723,7 @@ class Withheld(NamedTuple):
 
 
 NOTHING_WITHHELD: Final = Withheld(ScreenState())
-SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState, most_bytes=MOST_BYTES)
+SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
 
 
 @until_changed(SCREENED_FILE)

@@ -245,6 +245,16 @@ def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir
     assert not (bag_dir / LEAVING_FILE).exists()
 
 
+def test_days_that_somebody_deletes_first_are_not_announced_any_more(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    keep_all(bag_dir)
+    house(bag_dir, T0 + 100 * S, memory=days_of(bag_dir, keeps=False)).apply()
+    assert "memory/ is deleted" in str(reply_over(bag_dir, "memory_status"))
+    shutil.rmtree(bag_dir / "memory")
+    house(bag_dir, T0 + 100 * S).apply()  # as a recorder that starts and finds no days has it
+    assert "memory/ is deleted" not in str(reply_over(bag_dir, "memory_status"))
+
+
 def test_days_go_a_day_after_a_warning_also_where_the_disk_was_full_at_first(
     bag_dir: Path,
 ) -> None:
