@@ -186,31 +186,41 @@ def build_housekeeper(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.recorder.time_sync import is_synchronised
+    from ros2_memory.retention.collect import GarbageCollector
+    from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.storage.mcap.writer import McapWriter
 
     retention = settings.retention
     # At most half the budget, so that saved moments leave room for new recordings.
     moments_bytes = round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB)
-    rules = rules_of(settings, moments_bytes)
+    rules, clock = rules_of(settings, moments_bytes), WallClock()
+    rule_bytes = {rule.name: rule.max_bytes for rule in rules}
     bags, writer = BagDirReader(reader), McapWriter(settings.reader.max_chunk_mb)
-    return Housekeeping(
+    moments = MomentKeeper(bag_dir, moments_bytes, clock, own, rule_bytes)
+    collector = GarbageCollector(
         bag_dir,
         bags,
         writer,
-        WallClock(),
         retention_limits(settings),
+        own,
         is_synchronised=is_synchronised,
-        split_duration_s=settings.recording.split_duration_s,
-        own=own,
-        background=background,
-        moments_bytes=moments_bytes,
-        rule_bytes={rule.name: rule.max_bytes for rule in rules},
-        watch=_triggers_builder(settings, bag_dir, bags, own, rules) if rules else None,
-        screening=_build_screening(settings, bag_dir, reader, writer),
         static_topics=settings.data.tf_static_topics,
         grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         memory=_build_memory_days(settings, bag_dir, bags, own, writer),
         cutter=_build_topic_cutter(settings, bag_dir, reader, writer),
+    )
+    return Housekeeping(
+        bag_dir,
+        bags,
+        writer,
+        clock,
+        collector,
+        moments,
+        own=own,
+        split_duration_s=settings.recording.split_duration_s,
+        triggers=_build_triggers(settings, bags, moments, rules) if rules else None,
+        screening=_build_screening(settings, bag_dir, reader, writer),
+        background=background,
     )
 
 
@@ -275,14 +285,10 @@ def _extractor_of(settings: Settings) -> SchemaExtractor:
     return SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
 
 
-def _triggers_builder(
-    settings: Settings,
-    bag_dir: Path,
-    reader: BagReader,
-    own: OwnRecordings,
-    rules: Sequence[Rule],
-) -> Callable[[MomentKeeper], Triggers]:
-    """Returns a function that builds the triggers of `rules` for a keeper of moments."""
+def _build_triggers(
+    settings: Settings, reader: BagReader, moments: MomentKeeper, rules: Sequence[Rule]
+) -> Triggers:
+    """Returns the part that saves moments as `rules` say."""
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.triggers.rules import SplitSearch
     from ros2_memory.triggers.watch import Triggers
@@ -296,13 +302,13 @@ def _triggers_builder(
         topics.look()
         return topics.selection.matches(topic)
 
-    return partial(
-        Triggers,
-        bag_dir,
+    return Triggers(
+        moments.bag_dir,
         rules,
         SplitSearch(reader, _extractor_of(settings), rules),
-        own,
-        clock=WallClock(),
+        moments.own,
+        moments,
+        clock=moments.clock,
         split_duration_s=settings.recording.split_duration_s,
         is_recorded=is_recorded,
     )

@@ -13,7 +13,9 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.days import MemoryDays, MemoryLimits
 from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.retention.saved_moments import MomentKeeper
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.home import world
@@ -47,16 +49,13 @@ class Year:
         self._bag_dir = bag_dir
         self._clock = SettableClock(0)
         reader, writer, own = BagDirReader(McapReader()), McapWriter(), own_all(bag_dir)
-        self._house = Housekeeping(
+        collector = GarbageCollector(
             bag_dir,
             reader,
             writer,
-            self._clock,
             RetentionLimits(PLENTY, HOUR, keeps_foreign=True),
+            own,
             is_synchronised=lambda: True,
-            split_duration_s=split_s,
-            background=Direct(),
-            own=own,
             static_topics=("/tf_static",),
             memory=MemoryDays(
                 bag_dir,
@@ -67,6 +66,17 @@ class Year:
                 limits=MemoryLimits(texts=("*",), labels=("person",)),
                 static_topics=("/tf_static",),
             ),
+        )
+        self._house = Housekeeping(
+            bag_dir,
+            reader,
+            writer,
+            self._clock,
+            collector,
+            MomentKeeper(bag_dir, 0, self._clock, own, {}),
+            own=own,
+            split_duration_s=split_s,
+            background=Direct(),
         )
 
     def add(self, later: Path, day: int) -> None:

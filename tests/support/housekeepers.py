@@ -28,7 +28,9 @@ from ros2_memory.core.directories import identity_of
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.retention.saved_moments import MomentKeeper
 from ros2_memory.storage.base import BagReader, BagWriter
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -70,20 +72,28 @@ def keeper_of(
     )
     given: dict[str, Any] = {
         "is_synchronised": lambda: True,
-        "split_duration_s": 10.0,
-        "own": OwnRecordings(bag_dir),
-        "moments_bytes": PLENTY,
         "static_topics": ("/tf_static",),
         "measure_free": lambda _: PLENTY,
-        "background": Direct(),
     }
+    of_house = {name: how.pop(name) for name in ("screening", "background") if name in how}
+    own = how.pop("own", None) or OwnRecordings(bag_dir)
+    bags, writer = BagDirReader(reader or McapReader()), writer or McapWriter()
+    clock = clock or later()
+    moments = MomentKeeper(
+        bag_dir, how.pop("moments_bytes", PLENTY), clock, own, how.pop("rule_bytes", {})
+    )
+    watch = how.pop("watch", None)
     return Housekeeping(
         bag_dir,
-        BagDirReader(reader or McapReader()),
-        writer or McapWriter(),
-        clock or later(),
-        limits,
-        **given | how,
+        bags,
+        writer,
+        clock,
+        GarbageCollector(bag_dir, bags, writer, limits, own, **given | how),
+        moments,
+        own=own,
+        split_duration_s=10.0,
+        triggers=None if watch is None else watch(moments),
+        **{"background": Direct(), **of_house},
     )
 
 

@@ -92,6 +92,11 @@ class TopicTotals(NamedTuple):
             min(self.first, other.first), max(self.last, other.last), self.messages + other.messages
         )
 
+    @property
+    def is_rare(self) -> bool:
+        """Whether a message comes every `RARE_NS` or less often, from the first to the last."""
+        return self.last - self.first >= (self.messages - 1) * (RARE_NS - _JITTER_NS)
+
 
 NO_TOTALS: Final = TopicTotals(MAX_NS, MIN_NS, 0)
 """The totals of no message."""
@@ -117,9 +122,9 @@ class Pace(NamedTuple):
         Measured between the first and the last message, so that telemetry which fell silent stays
         frequent. A few messages are also rare if the recording went on for long enough.
         """
-        messages, span = self.topic.messages, self.topic.last - self.topic.first
-        if span >= (messages - 1) * (RARE_NS - _JITTER_NS):
+        if self.topic.is_rare:
             return True
+        messages, span = self.topic.messages, self.topic.last - self.topic.first
         length = self.end - self.begin
         return (
             messages < _FEW_MESSAGES

@@ -223,6 +223,8 @@ class MemoryDays:
     def limit(self, now: Ns | None) -> None:
         """Deletes days by age and then by size, and thins one old day to a message a minute.
 
+        If `memory.keep` is false, all days go in time, see `clear`.
+
         Args:
             now: the wall time that ages count from; None if the clock may be wrong: no day ages.
 
@@ -230,6 +232,9 @@ class MemoryDays:
             BagError: a day cannot be read or written.
             OSError: the folder cannot be read, or a day cannot be deleted.
         """
+        self.clear()
+        if not self.keeps:
+            return
         today = ""
         if now is not None:
             today = utc_day(now)

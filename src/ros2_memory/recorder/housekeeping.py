@@ -6,7 +6,7 @@ import shlex
 import threading
 import time
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -24,23 +24,17 @@ from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector
 from ros2_memory.retention.delete import remove_emptied
-from ros2_memory.retention.disk import free_bytes
-from ros2_memory.retention.latched_carry import Carrier
-from ros2_memory.retention.recorded_time import RecordedTime
 from ros2_memory.retention.repair import Repairer, open_files
-from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.recorder.background import Background
-    from ros2_memory.recorder.days import MemoryDays
-    from ros2_memory.retention.policy import RetentionLimits
-    from ros2_memory.retention.topic_ages import TopicCutter
+    from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
@@ -78,67 +72,36 @@ class Housekeeping:
     under way is not begun again.
 
     Args:
-        limits: how much is kept, and whether bags of other programs count; if they do not, they are
-            not repaired either.
-        is_synchronised: returns whether the system clock is synchronised; may take some seconds.
-        moments_bytes: the part of the budget that saved moments may take.
-        rule_bytes: the part of it that each rule may take.
-        watch: makes the rules' watch over recordings; None without rules.
+        collector: deletes bags beyond its limits. Bags of other programs that do not count there
+            are not repaired either.
+        moments: saves moments.
+        triggers: the rules' watch over recordings; None without rules.
         screening: excludes messages before splits are served; None if nothing is excluded.
-        grace_s: for how long a query may work on an older snapshot of the bags.
-        memory: keeps messages of deleted bags, or deletes those kept; None for neither.
-        cutter: cuts topics with a shorter life out of bags; None if no topic has one.
     """
 
     bag_dir: Path
     reader: BagReader
     writer: BagWriter
     clock: Clock
-    limits: RetentionLimits
+    collector: GarbageCollector
+    moments: MomentKeeper
     _: KW_ONLY
-    is_synchronised: Callable[[], bool]
-    split_duration_s: float
     own: OwnRecordings
-    moments_bytes: int = 0
-    rule_bytes: Mapping[str, int] = field(default_factory=dict)
-    watch: Callable[[MomentKeeper], Triggers] | None = None
+    split_duration_s: float
+    triggers: Triggers | None = None
     screening: Screening | None = None
-    static_topics: Collection[str] = ()
-    grace_s: float = 0.0
-    measure_free: Callable[[Path], int] = free_bytes
-    monotonic: Callable[[], float] = time.monotonic
-    memory: MemoryDays | None = None
-    cutter: TopicCutter | None = None
     background: Background
 
     def __post_init__(self) -> None:
-        bag_dir, reader, writer, own = self.bag_dir, self.reader, self.writer, self.own
-        static_topics, monotonic = self.static_topics, self.monotonic
-        self._recorded = RecordedTime(bag_dir)
-        self._collector = GarbageCollector(
-            bag_dir,
-            self.limits,
-            Carrier(bag_dir, reader, writer, static_topics, own, monotonic=monotonic),
-            own,
-            recorded=self._recorded,
-            is_synchronised=self.is_synchronised,
-            static_topics=static_topics,
-            grace_s=self.grace_s,
-            measure_free=self.measure_free,
-            monotonic=monotonic,
-            memory=self.memory if self.memory is not None and self.memory.keeps else None,
-            cutter=self.cutter,
-        )
+        self._limits = self.collector.limits
         self._index = IndexManager(
-            bag_dir,
-            reader,
+            self.bag_dir,
+            self.reader,
             self.clock,
             refresh_s=REFRESH_S,
             split_duration_s=self.split_duration_s,
         )
-        self._moments = MomentKeeper(bag_dir, self.moments_bytes, self.clock, own, self.rule_bytes)
-        self._triggers = None if self.watch is None else self.watch(self._moments)
-        self._repairer = Repairer(reader, writer, bag_dir)
+        self._repairer = Repairer(self.reader, self.writer, self.bag_dir)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * self.split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._out_of_reach = False
@@ -157,28 +120,20 @@ class Housekeeping:
         heartbeat, now = read_heartbeat(self.bag_dir).heartbeat, self.clock.now()
         if heartbeat is not None and heartbeat.state is not RecorderState.STOPPED:
             last_alive = min(heartbeat.updated, now)
-            if self._triggers is not None:
-                self._triggers.note_restart(last_alive, now)
+            if self.triggers is not None:
+                self.triggers.note_restart(last_alive, now)
             if heartbeat.state is RecorderState.RECORDING:
                 self._note_interruption(last_alive, now, "unclean")
             elif heartbeat.state is RecorderState.PAUSED:
                 self._note_interruption(min(heartbeat.since, now), now, "paused")
-        if self.limits.keeps_foreign:
+        if self._limits.keeps_foreign:
             for directory in filter(is_folder, self.bag_dir.iterdir()):
                 # A kill came before its directory was listed: nothing shows whose it is.
                 if self.own.is_announced(directory):
                     remove_if_empty(directory)
         # A kill may have come between the deletion of a last bag and of its directory.
         directories = (self.bag_dir / name for name in self.own.names())
-        self._collector.emptied.update(filter(self.own.owns, directories))
-        self._clear_memory()
-
-    def _clear_memory(self) -> None:
-        try:
-            if self.memory is not None:
-                self.memory.clear()
-        except OSError as error:
-            _log.error("memory_not_limited", reason=error.strerror or str(error))
+        self.collector.emptied.update(filter(self.own.owns, directories))
 
     def make_room(self, free_bytes_wanted: int) -> None:
         """Begins to delete the oldest bags until so much is free, or no bag may be deleted."""
@@ -224,20 +179,20 @@ class Housekeeping:
 
     def _save_requested_moments(self) -> None:
         """Saves requested and pending moments, and those of rules if a recording began anew."""
-        self._moments.open()
-        has_restarted = self._triggers is not None and bool(self._triggers.restarts)
-        if has_restarted or self._moments.has_work():
+        self.moments.open()
+        has_restarted = self.triggers is not None and bool(self.triggers.restarts)
+        if has_restarted or self.moments.has_work():
             self._save_moments(before_deletion=False)
 
     def _save_moments(self, *, before_deletion: bool) -> None:
         """Saves pending moments; those of rules if bags may be deleted, or recording restarted."""
         with self._index.undisturbed() as snapshot:
-            if self._moments.has_work():
-                self._moments.keep(snapshot)
+            if self.moments.has_work():
+                self.moments.keep(snapshot)
             if before_deletion:
-                self._moments.relink_sidecars()
-            if self._triggers is not None and (before_deletion or self._triggers.restarts):
-                self._triggers.look(snapshot)
+                self.moments.relink_sidecars()
+            if self.triggers is not None and (before_deletion or self.triggers.restarts):
+                self.triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
         """Writes down that a recording ended unexpectedly, or was paused until now.
@@ -247,8 +202,8 @@ class Housekeeping:
             how: a key of `INTERRUPTIONS`.
         """
         now = self.clock.now()
-        if self._triggers is not None and how != "paused":
-            self._triggers.note_restart(now, now)
+        if self.triggers is not None and how != "paused":
+            self.triggers.note_restart(now, now)
         self._note_interruption(min(first, now), now, how)
 
     def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
@@ -319,7 +274,7 @@ class Housekeeping:
 
         Call it several times a second, with no recordings while nothing is recorded.
         """
-        self._recorded.note(recordings, bytes_written, monotonic_s, self.clock.now())
+        self.collector.recorded.note(recordings, bytes_written, monotonic_s, self.clock.now())
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
@@ -328,7 +283,6 @@ class Housekeeping:
         except (EpisodicError, OSError) as error:
             # Only reported: if it stopped the deletion, the disk would fill.
             _log.error("moments_not_minded", reason=str(error))
-        self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
         self._status = self._status._replace(
@@ -352,14 +306,14 @@ class Housekeeping:
         )
         self._report_changes(before, collected)
         self._write_losses()  # there may be room now
-        if self._triggers is not None and collected.needed:
-            self._triggers.note_deleted(collected.needed)
+        if self.triggers is not None and collected.needed:
+            self.triggers.note_deleted(collected.needed)
         return collected
 
     def _describe_held(self, bags: int) -> str | None:
         if not bags:
             return None
-        limit = f"{self.limits.max_age_ns / NS_PER_HOUR:g} h"
+        limit = f"{self._limits.max_age_ns / NS_PER_HOUR:g} h"
         return (
             f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
             "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
@@ -374,12 +328,12 @@ class Housekeeping:
             known = self._index.known_bags(live, snapshot)
             needed = frozenset[str]()
             try:
-                if self._triggers is not None:
-                    needed = self._triggers.needed(snapshot)
+                if self.triggers is not None:
+                    needed = self.triggers.needed(snapshot)
             except OSError:  # reported when moments were saved
                 # Age then deletes no bag. The budget deletes the oldest, or the disk would fill.
                 needed = frozenset(bag.file for bag in snapshot.bags)
-            collected = self._collector.apply(known, snapshot, needed, free_bytes_wanted)
+            collected = self.collector.apply(known, snapshot, needed, free_bytes_wanted)
         if collected.bags or collected.cut:
             self._index.refresh()
         return collected
@@ -400,7 +354,7 @@ class Housekeeping:
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        total, most = collected.total_bytes, self.limits.max_total_bytes
+        total, most = collected.total_bytes, self._limits.max_total_bytes
         if before.total_bytes <= most < total:
             state, saved = collected.state_bytes, collected.saved_bytes
             _log.error(
@@ -432,7 +386,7 @@ class Housekeeping:
         for path, status in files:
             size = status.st_size
             is_small = size <= MOST_REPAIRED_BYTES
-            if is_small and self.measure_free(self.bag_dir) < size:
+            if is_small and self.collector.measure_free(self.bag_dir) < size:
                 continue  # until there is room for the new file beside it
             if (status.st_dev, status.st_ino) in opened:
                 continue
@@ -471,7 +425,7 @@ class Housekeeping:
 
         The heartbeat does not name what other programs write.
         """
-        if self.limits.keeps_foreign:
+        if self._limits.keeps_foreign:
             return self.own.owns_bag(path)
         unchanged_for = abs(self.clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)

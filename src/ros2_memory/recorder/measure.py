@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR, NS_PER_S, Ns, ns_from_unix
-from ros2_memory.index.segment import Pace, TopicTotals
+from ros2_memory.index.segment import TopicTotals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -215,10 +215,9 @@ class LossCounter:
             topic_holes = holes(series.positions, series.kind)
             if topic_holes is not None:
                 self._counted.add(topic)
-            settled = 0
-            for index, position in enumerate(series.positions):
-                if position.log_time <= until:
-                    settled = index
+            positions = enumerate(series.positions)
+            reached = (index for index, position in positions if position.log_time <= until)
+            settled = max(reached, default=0)
             for hole in topic_holes or ():
                 if hole.before.value < series.settled:
                     continue
@@ -566,7 +565,7 @@ class _Topic:
         if arrival.messages < _REGULAR or arrival.last - arrival.first < MEASURED_NS:
             return False
         totals = TopicTotals(arrival.first, arrival.last, arrival.messages)
-        if self.latched and Pace(totals, arrival.first, arrival.last).is_rare:
+        if self.latched and totals.is_rare:
             return False  # its publisher is silent until something changes
         return self.resumed is None or now - self.resumed > IRREGULAR_NS
 

@@ -7,7 +7,7 @@ bag. Meanwhile the next oldest bag is deleted instead; if there is none, the lim
 
 from __future__ import annotations
 
-import os
+import time
 from collections import defaultdict
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
@@ -19,8 +19,9 @@ from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of,
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.retention.delete import remove_bag, remove_emptied
-from ros2_memory.retention.disk import RETRIED_S
+from ros2_memory.retention.disk import RETRIED_S, free_bytes
 from ros2_memory.retention.inventory import Inventory
+from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.policy import (
     DeletionPlan,
     DirContents,
@@ -29,6 +30,7 @@ from ros2_memory.retention.policy import (
     bags_older_than,
     plan_deletions,
 )
+from ros2_memory.retention.recorded_time import RecordedTime
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -37,9 +39,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.latched_carry import Carrier
-    from ros2_memory.retention.recorded_time import RecordedTime
     from ros2_memory.retention.topic_ages import TopicCutter
+    from ros2_memory.storage.base import BagReader, BagWriter
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
@@ -94,7 +95,8 @@ class _Pass:
         needed: the bags that rules may still need.
         needs_disk: whether the pass makes room on the disk.
         urgent: whether it does not wait until carried messages have been known for long enough.
-        synchronised: whether the system clock is synchronised; None until asked.
+        synchronised: whether the system clock is synchronised; None until asked, which starts a
+            program.
         remaining: bags that this pass does not delete.
         waiting: the remaining bags that can be deleted some moments later.
         saved: deleted bags whose files are saved in moments.
@@ -119,7 +121,13 @@ class _Pass:
 
 
 class DeletedBagMemory(Protocol):
-    """The memory of deleted bags: a part of their messages, in fewer bytes."""
+    """The memory of deleted bags: a part of their messages, in fewer bytes.
+
+    Attributes:
+        keeps: whether anything is remembered; if not, `limit` forgets it all in time.
+    """
+
+    keeps: bool
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
         """Stores the memory of bags durably, before they are deleted.
@@ -142,31 +150,42 @@ class GarbageCollector:
     """Keeps one bag directory within its limits. Not thread-safe.
 
     Args:
-        recorded: how long was recorded after each recording.
-        grace_s: how long latched messages are carried before their bag is deleted.
-        memory: the memory of deleted bags; None if nothing is remembered.
+        is_synchronised: returns whether the system clock is synchronised; may take some seconds.
+        grace_s: how long latched messages are carried before their bag is deleted: for so long a
+            query may work on an older snapshot of the bags.
+        memory: the memory of deleted bags; None if nothing is, or was, remembered.
         cutter: cuts topics with a shorter life out of bags that stay; None if there are none.
 
     Attributes:
+        recorded: how long was recorded after each recording.
         emptied: recordings that go with the next pass if no bag is left of them.
     """
 
     bag_dir: Path
+    reader: BagReader
+    writer: BagWriter
     limits: RetentionLimits
-    carrier: Carrier
     own: OwnRecordings
     _: KW_ONLY
-    recorded: RecordedTime
     is_synchronised: Callable[[], bool]
     static_topics: Collection[str]
-    grace_s: float
-    measure_free: Callable[[Path], int]
-    monotonic: Callable[[], float]
-    memory: DeletedBagMemory | None
-    cutter: TopicCutter | None
+    grace_s: float = 0.0
+    measure_free: Callable[[Path], int] = free_bytes
+    monotonic: Callable[[], float] = time.monotonic
+    memory: DeletedBagMemory | None = None
+    cutter: TopicCutter | None = None
 
     def __post_init__(self) -> None:
         """Starts with nothing known."""
+        self.recorded = RecordedTime(self.bag_dir)
+        self._carrier = Carrier(
+            self.bag_dir,
+            self.reader,
+            self.writer,
+            self.static_topics,
+            self.own,
+            monotonic=self.monotonic,
+        )
         self._memory_fails_since: float | None = None
         self._inventory = Inventory(
             self.bag_dir, self.static_topics, self.own if self.limits.keeps_foreign else None
@@ -203,10 +222,12 @@ class GarbageCollector:
         run = _Pass(known, snapshot, needed, limits, needs_disk, urgent=needs_disk)
         contents, plan = self._delete_beyond_limits(run)
         self._remove_emptied(run)
-        if self.memory is not None:
-            self._limit_memory(self.memory, contents, snapshot)
+        self._limit_memory(contents, snapshot)
         if self.cutter is not None and not needs_disk and plan.fits:
-            self._cut_topics(self.cutter, contents, run)
+            try:
+                run.result.cut = self.cutter.cut(contents, limits, snapshot)
+            except OSError as error:
+                _log.error("topics_not_cut", reason=error.strerror or str(error))
         return replace(
             run.result,
             total_bytes=plan.total_bytes,
@@ -222,10 +243,11 @@ class GarbageCollector:
 
     def _delete_beyond_limits(self, run: _Pass) -> tuple[DirContents, DeletionPlan]:
         """Deletes bags until the limits are kept; returns what is left, and the last plan."""
+        keeps = self.memory is not None and self.memory.keeps
         while True:
             contents = self._contents(run)
             # Whole hours, so that the memory of an hour is written once.
-            plan = plan_deletions(contents, run.limits, whole_hours=self.memory is not None)
+            plan = plan_deletions(contents, run.limits, whole_hours=keeps)
             going = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
             if going:
                 for bag in going:
@@ -242,65 +264,51 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
 
-    def _limit_memory(
-        self, memory: DeletedBagMemory, contents: DirContents, snapshot: Snapshot
-    ) -> None:
+    def _limit_memory(self, contents: DirContents, snapshot: Snapshot) -> None:
+        if self.memory is None:
+            return
         # As bags do, days age by the newest that is recorded, and by a clock that is right.
         newest = snapshot.latest if contents.synchronised else None
         try:
-            memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
+            self.memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
         except (EpisodicError, OSError) as error:
             _log.error("memory_not_limited", reason=str(error))
-
-    def _cut_topics(self, cutter: TopicCutter, contents: DirContents, run: _Pass) -> None:
-        left = [bag for bag in contents.bags if bag.path not in run.deleted]
-        try:
-            run.result.cut = cutter.cut(replace(contents, bags=left), run.limits, run.snapshot)
-        except OSError as error:
-            _log.error("topics_not_cut", reason=error.strerror or str(error))
 
     def _contents(self, run: _Pass) -> DirContents:
         """Returns the bags with all that the plan needs; counts those that the clock holds."""
         contents = self._inventory.contents(run.known, deleted=run.deleted, remaining=run.remaining)
-        root = f"{self.bag_dir}{os.sep}"
-        names = {bag.recording: self.own.name_of(bag.recording) for bag in contents.bags}
-        since = self.recorded.since(names.values())
-        doubtful = self.recorded.doubtful(names.values())
-        order = {name: place for place, name in enumerate(self.own.in_order())}
-        bags = ((bag.path.removeprefix(root), bag.size) for bag in contents.bags)
-        missing = unshipped(self.bag_dir, bags) if run.limits.require_shipped else ()
+        recordings = {bag.recording for bag in contents.bags}
+        missing = frozenset[str]()
+        if run.limits.require_shipped:
+            missing = unshipped(self.bag_dir, ((bag.path, bag.size) for bag in contents.bags))
         contents = replace(
             contents,
             free_bytes=self.measure_free(self.bag_dir) if run.needs_disk else None,
-            recorded_since={path: since[name] for path, name in names.items()},
-            doubtful=frozenset(path for path, name in names.items() if name in doubtful),
-            places={path: order[name] for path, name in names.items() if name in order},
+            recorded_since=self.recorded.since(recordings),
+            doubtful=self.recorded.doubtful(recordings),
+            places={name: place for place, name in enumerate(self.own.in_order())},
             needed=run.needed,
-            unshipped=frozenset(root + path for path in missing),
+            unshipped=missing,
         )
         aged = bags_older_than(contents, run.limits, run.limits.max_age_ns)
         is_clock_decisive = aged.if_synchronised != aged.if_unsynchronised
-        if is_clock_decisive or self.recorded.asks_for_clock() or self.cutter is not None:
-            self._ask_clock(run)
+        wants_clock = is_clock_decisive or self.recorded.asks_for_clock() or self.cutter is not None
+        if wants_clock and run.synchronised is None:
+            run.synchronised = self.is_synchronised()
+            if run.synchronised:
+                self.recorded.confirm_clock()
         synchronised = bool(run.synchronised)
         held = aged.if_synchronised - aged.by_clock(synchronised=synchronised)
         run.result.held = len(held)
         return replace(contents, synchronised=synchronised)
 
-    def _ask_clock(self, run: _Pass) -> None:
-        """Asks once in a pass whether the clock is synchronised, as that starts a program."""
-        if run.synchronised is None:
-            run.synchronised = self.is_synchronised()
-            if run.synchronised:
-                self.recorded.confirm_clock()
-
     def _carry(self, to_delete: Sequence[StoredBag], run: _Pass) -> None:
         """Carries latched messages on. A bag remains if that failed, or was done just now."""
-        paths = {Path(path) for path in (*run.deleted, *(bag.path for bag in to_delete))}
-        files = {bag.file for bag in self.carrier.with_latched(run.snapshot, paths)}
+        paths = run.deleted.union(bag.path for bag in to_delete)
+        files = {bag.file for bag in self._carrier.with_latched(run.snapshot, paths)}
         latched = [bag for bag in to_delete if bag.path in files]
         try:
-            carried = self.carrier.carry(run.snapshot, paths, {*map(Path, run.saved)})
+            carried = self._carrier.carry(run.snapshot, paths, run.saved)
         except (EpisodicError, OSError) as error:
             # Bags without latched messages can still be deleted, and may free enough space.
             for bag in latched:
@@ -320,7 +328,7 @@ class GarbageCollector:
         self, going: list[StoredBag], contents: DirContents, run: _Pass
     ) -> list[StoredBag]:
         """Writes the memory of bags; returns the bags that may be deleted now."""
-        if self.memory is None:
+        if self.memory is None or not self.memory.keeps:
             return going
         try:
             # A moment has all messages of its bags.
@@ -360,8 +368,7 @@ class GarbageCollector:
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
             if bag.path not in self._not_deleted:
-                name = self.own.name_of(bag.recording)
-                splits[name].append((bare_name(bag.path), bag.start, bag.end))
+                splits[bag.recording].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         self._append_unwritten()
         for bag in going:

@@ -32,7 +32,7 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.file_state import FileState
-from ros2_memory.index.segment import Pace, TopicTotals
+from ros2_memory.index.segment import TopicTotals
 from ros2_memory.retention.delete import sidecar_bytes, size_of
 from ros2_memory.retention.policy import DirContents, StoredBag, StoredFile
 
@@ -171,7 +171,6 @@ class Inventory:
         other_bytes = state_bytes = state_bytes_in(self.root)
         foreign_bytes = 0
         recordings: set[str] = set()
-        named = {str(self.root / name) for name in known.named}
         judge = None
         if self.own is not None:
             self.own.names()  # reads the list anew, or fails
@@ -180,8 +179,9 @@ class Inventory:
             path, recording = bag.path, bag.recording
             if path in deleted:
                 continue
-            name, is_named = path[len(recording) + 1 :], recording in named
-            is_own = judge is None or judge(recording)(name)
+            folder, _, name = path.rpartition("/")
+            is_named = recording in known.named
+            is_own = judge is None or judge(folder)(name)
             is_saved = path in known.tree.saved
             # A split is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
@@ -196,7 +196,7 @@ class Inventory:
                 bags.append(bag)
             elif self._counts(state, bag):
                 other_bytes += sum(file.size for file in bag.files)
-        other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
+        other_bytes += sum(self._folder_of(name, known.now).size for name in recordings)
         return DirContents(
             bags,
             known.now,
@@ -249,14 +249,14 @@ class Inventory:
             self._settled_bags[bag.file] = self._stored(bag.file, bag, stamp, known.now)
         if before.keys() - self._settled_bags.keys():
             left = {bag.recording for bag in self._settled_bags.values()}
-            self._folders = {path: self._folders[path] for path in self._folders.keys() & left}
+            self._folders = {name: self._folders[name] for name in self._folders.keys() & left}
         for stored in self._settled_bags.values():
             yield FileState.CLOSED, stored
 
     def _stored(self, path: str, bag: BagFile | None, stamp: Stamp, now: Ns) -> StoredBag:
-        recording = sys.intern(path.rpartition("/")[0])
+        recording = sys.intern(path.rpartition("/")[0][len(str(self.root)) + 1 :])
         span = _UNDATED if bag is None else self._dating_span(bag)
-        device = self._folder_at(recording, now).device
+        device = self._folder_of(recording, now).device
         return StoredBag(path, recording, *span, stamp.mtime_ns, device, stamp.inode, stamp.size)
 
     def _counts(self, state: FileState, bag: StoredBag) -> bool:
@@ -279,20 +279,19 @@ class Inventory:
         """Whether each recording may receive all of a topic's messages in a bag again."""
         if topic.topic in self.static_topics:
             return True
-        totals = TopicTotals(topic.first, topic.last, topic.count)
-        return topic.latched and Pace(totals, topic.first, topic.last).is_rare
+        return topic.latched and TopicTotals(topic.first, topic.last, topic.count).is_rare
 
-    def _folder_at(self, path: str, now: Ns) -> _Folder:
-        folder = self._folders.get(path)
+    def _folder_of(self, recording: str, now: Ns) -> _Folder:
+        folder, path = self._folders.get(recording), self.root / recording
         try:
-            status = Path(path).stat()
+            status = path.stat()
         except OSError:
             return _Folder(0, device=-1, size=0)
         if folder is None or folder.mtime_ns != status.st_mtime_ns:
-            folder = _Folder(status.st_mtime_ns, status.st_dev, sidecar_bytes(Path(path)))
+            folder = _Folder(status.st_mtime_ns, status.st_dev, sidecar_bytes(path))
             # metadata.yaml is created first and written some moments later.
             if abs(now - status.st_mtime_ns) >= COMPLETE_AFTER_NS:
-                self._folders[path] = folder
+                self._folders[recording] = folder
         return folder
 
 

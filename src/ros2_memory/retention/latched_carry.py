@@ -185,19 +185,16 @@ class Carrier:
         self._failing = FailingFiles(self.monotonic)
         self._late: _LateMessages = {}
 
-    def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
+    def with_latched(self, snapshot: Snapshot, paths: Collection[str]) -> tuple[BagFile, ...]:
         """Returns the bags of `paths` with messages of a latched topic."""
-        wanted = {str(path) for path in paths}
         topics = self.topics(snapshot)
         return tuple(
             bag
             for bag in snapshot.bags
-            if bag.file in wanted and not bag.summary.schema.positions.keys().isdisjoint(topics)
+            if bag.file in paths and not bag.summary.schema.positions.keys().isdisjoint(topics)
         )
 
-    def carry(
-        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path]
-    ) -> int | None:
+    def carry(self, snapshot: Snapshot, to_delete: set[str], saved: Collection[str]) -> int | None:
         """Writes the messages that must outlive the bags to delete, durably.
 
         Returns how many messages are carried then, or None if nothing had to be written. A bag that
@@ -211,7 +208,7 @@ class Carrier:
         if not with_messages:
             return None
         topics = self.topics(snapshot)
-        gone = {str(path) for path in {*to_delete} - {*saved}}
+        gone = to_delete.difference(saved)
         kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_derived(bag.file)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
@@ -303,10 +300,10 @@ class Carrier:
         missing = {*chosen}
         for path in sources:
             for record in self._records(path, topics):
-                log_time, identity, _ = latched_message(record, ())
-                if (log_time, identity) in missing:
-                    missing.remove((log_time, identity))
-                    origin = chosen[log_time, identity]
+                copy = latched_message(record, ()).copy
+                if copy in missing:
+                    missing.remove(copy)
+                    origin = chosen[copy]
                     yield record if origin is None else with_origin(record, origin)
 
     def _frames(self, record: Record) -> tuple[str, ...]:
@@ -321,7 +318,7 @@ class Carrier:
         return tuple({str(getattr(transform, "child_frame_id", "")) for transform in transforms})
 
     def _repeated(
-        self, snapshot: Snapshot, topics: Iterable[str], to_delete: Collection[Path]
+        self, snapshot: Snapshot, topics: Iterable[str], to_delete: Collection[str]
     ) -> dict[MessageIdentity, Ns]:
         """Returns the late messages of kept bags, and their earliest log time.
 
@@ -332,7 +329,7 @@ class Carrier:
         for topic in topics:
             first_bags: dict[Path, BagFile] = {}
             for bag in snapshot.bags:
-                is_kept = bag.path not in to_delete and not is_derived(bag.file)
+                is_kept = bag.file not in to_delete and not is_derived(bag.file)
                 if is_kept and topic in bag.summary.schema.positions:
                     first_bags.setdefault(bag.recording, bag)
             for bag in first_bags.values():

@@ -31,6 +31,7 @@ well, goes last. The newest bag always stays.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -89,8 +90,8 @@ class StoredBag(NamedTuple):
     `start` and `end` are the log times of its first and last message (inclusive). They leave
     latched topics out, since each recording receives those again: a bag that contains nothing else
     ends before it starts. `written` is when its file was last modified; `recording` is the
-    directory that it lies in. `device` to `size` are its file, see `StoredFile`; `second` is its
-    other form, if that lies there as well.
+    directory that it lies in, relative to the bag directory. `device` to `size` are its file, see
+    `StoredFile`; `second` is its other form, if that lies there as well.
     """
 
     path: str
@@ -219,20 +220,22 @@ def plan_deletions(
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(contents, dated, limits, periods[-1] if periods else [])
     newest = _newest_path(order, contents, periods)
-    hours = _split_by_hour(order)
+    hours = _split_by_hour(order) if whole_hours else []
     needed = contents.needed | contents.unshipped
     order = [bag for bag in order if bag.path != newest]
     if whole_hours:
-        aged = _aged_in_whole_hours(aged, hours, needed | {newest})
+        goes_or_is_ageless = aged | needed | {newest}
+        aged &= set[str]().union(*(hour for hour in hours if hour <= goes_or_is_ageless))
     left.delete_until_fits(order, aged, limits)
     most_free = None
     if left.free is not None and left.free < limits.min_free_bytes:
         most_free = left.free
         left = _Remaining(replace(contents, free_bytes=None))
         left.delete_until_fits(order, aged, limits)
-    going = left.deleted
-    if whole_hours:
-        going = going | (_rest_of_hours(going - aged, hours, newest) - needed)
+    going, for_room = left.deleted, left.deleted - aged
+    for hour in hours:
+        if newest not in hour and not hour.isdisjoint(for_room):
+            going |= hour - needed
     return DeletionPlan(
         tuple(bag for bag in order if bag.path in going),
         total,
@@ -259,38 +262,16 @@ def _newest_path(
     return candidates[-1].path if candidates else ""
 
 
-def _split_by_hour(order: Sequence[StoredBag]) -> list[_Period]:
-    """Splits the bags where another hour begins, and where the clock was set back."""
-    hours: list[_Period] = []
+def _split_by_hour(order: Sequence[StoredBag]) -> list[set[str]]:
+    """Returns the paths of bags by hour; another begins where the clock was set back, too."""
+    hours: list[set[str]] = []
     before: StoredBag | None = None
     for bag in order:
         if before is None or bag.hour != before.hour or bag.date < before.date:
-            hours.append([])
-        hours[-1].append(bag)
+            hours.append(set())
+        hours[-1].add(bag.path)
         before = bag
     return hours
-
-
-def _aged_in_whole_hours(
-    aged: frozenset[str], hours: Sequence[_Period], ageless: frozenset[str]
-) -> frozenset[str]:
-    """Returns the aged bags of hours in which all other bags are ageless."""
-    whole: set[str] = set()
-    for hour in hours:
-        paths = {bag.path for bag in hour}
-        if paths <= aged | ageless:
-            whole |= paths & aged
-    return frozenset(whole)
-
-
-def _rest_of_hours(going: set[str], hours: Sequence[_Period], newest: str) -> set[str]:
-    """Returns all bags of the hours from which bags go, except for the hour of the newest bag."""
-    rest: set[str] = set()
-    for hour in hours:
-        paths = {bag.path for bag in hour}
-        if newest not in paths and not going.isdisjoint(paths):
-            rest |= paths
-    return rest
 
 
 class _Remaining:
@@ -356,11 +337,8 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
     for bag in credible:
         if bag.recording in contents.places:
             newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
-    earliest: dict[str, Ns] = {}
-    latest = MIN_NS
-    for name in names:
-        earliest[name] = latest
-        latest = max(latest, newest.get(name, MIN_NS))
+    newest_in_order = [newest.get(name, MIN_NS) for name in names]
+    earliest = dict(zip(names, accumulate([MIN_NS, *newest_in_order], max), strict=False))
     replacements = _replacement_dates(names, newest, earliest)
     bags = [
         bag.dated(replacements[bag.recording])
@@ -392,12 +370,9 @@ def _replacement_dates(
 
 def _never_rising(recorded_since: Mapping[str, Ns], names: Sequence[str]) -> dict[str, Ns]:
     """Returns how long was recorded after each recording: never more than after an earlier one."""
-    since = dict(recorded_since)
-    least = MAX_NS
-    for name in names:
-        if name in since:
-            least = since[name] = min(least, since[name])
-    return since
+    known = [name for name in names if name in recorded_since]
+    least = accumulate((recorded_since[name] for name in known), min)
+    return {**recorded_since, **dict(zip(known, least, strict=True))}
 
 
 _Period: TypeAlias = "list[StoredBag]"
@@ -433,19 +408,14 @@ def _aged_bags(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
     old_recordings = {name for name, since in contents.recorded_since.items() if since > max_age_ns}
     by_dates = _aged_by_dates(contents, periods, max_age_ns)
     stays = contents.needed | contents.unshipped
-    if_synchronised: set[str] = set()
-    if_unsynchronised: set[str] = set()
-    for bag in contents.bags:
-        if bag.path in stays:
-            continue
-        by_recorded_time = bag.recording in old_recordings
-        if by_recorded_time:
-            if_unsynchronised.add(bag.path)
-        is_doubtful = bag.recording in contents.doubtful
-        is_old = by_recorded_time if is_doubtful else bag.path in by_dates
-        if is_old:
-            if_synchronised.add(bag.path)
-    return AgedBags(frozenset(if_synchronised), frozenset(if_unsynchronised))
+    by_recorded_time = frozenset(
+        bag.path
+        for bag in contents.bags
+        if bag.recording in old_recordings and bag.path not in stays
+    )
+    doubtful = {bag.path for bag in contents.bags if bag.recording in contents.doubtful}
+    if_synchronised = (by_recorded_time & doubtful) | (by_dates - doubtful - stays)
+    return AgedBags(if_synchronised, by_recorded_time)
 
 
 def _aged_by_dates(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns) -> set[str]:

@@ -221,7 +221,7 @@ def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir
     def started(*, keeps: bool = False) -> Housekeeping:
         days = days_of(bag_dir, keeps=keeps, monotonic=lambda: monotonic.now() / S)
         keeper = house(bag_dir, T0 + 100 * S, memory=days)
-        keeper.prepare()
+        keeper.apply()
         return keeper
 
     keeper = started()

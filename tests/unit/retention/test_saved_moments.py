@@ -76,7 +76,7 @@ def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
     asked(tmp_path, 15, 25)
     with house._index.undisturbed() as snapshot:
         made[1].unlink()
-        house._moments.keep(snapshot)
+        house.moments.keep(snapshot)
     reported = told_of(tmp_path)
     missing = [f"{name}/{name}_1.mcap is missing, or another file has its name"]
     assert (reported["complete"], reported["missing"]) == (False, missing)

@@ -398,7 +398,7 @@ class _Forget:
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             snapshot = self._memory.index.refresh()
             bags = self._unchanged(planned, snapshot)
-            carried, paths = None, {bag.path for bag in bags}
+            carried, paths = None, {bag.file for bag in bags}
             if recorder is None:
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
             else:  # it carries messages and writes days, and two programs must not do so at a time
@@ -549,13 +549,13 @@ def _describe_span(first: Ns, last: Ns) -> str:
     return f"from {format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
 
 
-def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
+def _with_other_links(bags: Sequence[BagFile]) -> set[str]:
     """Returns the bags that have further hard links, as saved moments have."""
-    linked = set[Path]()
+    linked = set[str]()
     for bag in bags:
         with suppress(OSError):
             if bag.path.lstat().st_nlink > 1:
-                linked.add(bag.path)
+                linked.add(bag.file)
     return linked
 
 
