@@ -326,7 +326,7 @@ def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
             cut = published + 1
             begun = replace(after, previous=old.name, counts_from=cut)
             write_handover(new, _with_begin(begun, new, logged, reader))
-            write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
+            write_handover(old, replace(before, counts_until=cut))
             return
         counts = replace(after, state=Counting.COUNTS, previous=old.name, compared=True)
         write_handover(new, counts)
@@ -496,8 +496,8 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     count = len(in_old) + len(in_new)
     if count > MOST_LISTED:
         # Without a cut all messages of both recordings count.
-        old_sidecar = replace(before, end=_without_files(before.end)) if is_next else before
-        new_sidecar = replace(after, state=Counting.COUNTS, begin=_without_files(after.begin))
+        old_sidecar = replace(before, end=None) if is_next else before
+        new_sidecar = replace(after, state=Counting.COUNTS, begin=None)
     else:
         old_sidecar, new_sidecar = _with_listed(before, in_old), _with_listed(after, in_new)
     changed = {new: replace(new_sidecar, compared=True)}
@@ -507,10 +507,6 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     if count:
         _log.info("handover_compared", recording=old.name, next=new.name, messages=count)
     return True
-
-
-def _without_files(overlap: Overlap | None) -> Overlap | None:
-    return None if overlap is None else replace(overlap, files=())
 
 
 def _miscounted(old: _Side, new: _Side, *, latched: bool) -> tuple[list[_Copy], list[_Copy]]:
