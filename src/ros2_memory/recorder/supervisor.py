@@ -12,7 +12,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.sd_notify import Watchdog
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover import Step
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.housekeeping import Housekeeping
-    from ros2_memory.recorder.reception import Rotation
 
 HEARTBEAT_S: Final = 5.0
 """How often `recorder.json` is written."""
@@ -139,7 +138,9 @@ class Supervisor:
             _Task("faults", lambda _: self._events.report_faults(background.faults())),
             _Task("house", self._apply_retention, needs_disk=True),
             _Task("moments", lambda _: housekeeper.keep_moments(), MOMENTS_S, needs_disk=True),
-            _Task("screen", self._screen, SCREENING_S, needs_disk=True),
+            _Task(
+                "screen", lambda _: housekeeper.screen(self._names()), SCREENING_S, needs_disk=True
+            ),
         )
 
     @property
@@ -212,7 +213,7 @@ class Supervisor:
             self._keep_alive()
             try:
                 task.run(now)
-            except OSError as error:
+            except (EpisodicError, OSError) as error:
                 # A disk or a server may fail at any access: the next tick tries again.
                 if self._is_due(f"report {task.name}", FAULT_S, now):
                     self._events.fail("supervision_failed", str(error), task=task.name)
@@ -334,14 +335,12 @@ class Supervisor:
             self._put_off("rotate", now)
             return
         if resubscribe is not None:
-            self._report_resubscription(resubscribe, current.name, now)
-
-    def _report_resubscription(self, rotation: Rotation, recording: str, now: ClockReading) -> None:
-        self._reception.note_rotation(rotation, now.monotonic_s)
-        if rotation.is_fault:
-            self._events.warn(rotation.event, rotation.sentence, recording=recording)
-        else:
-            self._events.info(rotation.event, reason=rotation.sentence, recording=recording)
+            self._reception.note_rotation(resubscribe, now.monotonic_s)
+            event, sentence = resubscribe.event, resubscribe.sentence
+            if resubscribe.is_fault:
+                self._events.warn(event, sentence, recording=current.name)
+            else:
+                self._events.info(event, reason=sentence, recording=current.name)
 
     def _check_list(self, _: ClockReading) -> None:
         """Requests a rotation if the list of topics was changed."""
@@ -381,9 +380,6 @@ class Supervisor:
         self.housekeeper.note_recorded(
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
-
-    def _screen(self, _: ClockReading) -> None:
-        self.housekeeper.screen(self._names())
 
     def _apply_retention(self, now: ClockReading) -> None:
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
