@@ -152,14 +152,6 @@ class Refusal(NamedTuple):
     sentence: str
 
 
-class _MomentRefusedError(Exception):
-    """A moment cannot be saved; the text is the reason."""
-
-    def __init__(self, kind: str, sentence: str) -> None:
-        super().__init__(sentence)
-        self.refusal = Refusal(kind, sentence)
-
-
 @dataclass(eq=False, repr=False)
 class MomentKeeper:
     """The moments of one bag directory. Not thread-safe, except for `has_work`.
@@ -214,14 +206,14 @@ class MomentKeeper:
             moment = _moment_of(request, stored)
             if moment is None:
                 moment = self._begin_moment(SavedMoment(request), stored, snapshot)
-                stored.readable[moment.folder.name] = moment
-        except _MomentRefusedError as error:
-            refused = str(error)
         except OSError as error:
             folder = self.bag_dir / MOMENTS_FOLDER
             refused = f"the bags cannot be saved in {folder}: {error.strerror or error}"
         else:
-            return Outcome(moment.folder.name, len(moment.files), moment.moment.pending)
+            if not isinstance(moment, Refusal):
+                stored.readable[moment.folder.name] = moment
+                return Outcome(moment.folder.name, len(moment.files), moment.moment.pending)
+            refused = moment.sentence
         _log.warning("moment_refused", label=request.label, reason=refused)
         return Outcome(refused=refused)
 
@@ -239,10 +231,9 @@ class MomentKeeper:
         wanted = SavedMoment(request, rule=rule, matches=matches)
         known = _moment_of(request, stored)
         if known is None:
-            try:
-                self._begin_moment(wanted, stored, snapshot)
-            except _MomentRefusedError as error:
-                return error.refusal
+            begun = self._begin_moment(wanted, stored, snapshot)
+            if isinstance(begun, Refusal):
+                return begun
             self._waiting = True
         elif known.moment.matches < matches or known.moment.request.end < request.end:
             extended = known._replace(moment=replace(wanted, missing=known.moment.missing))
@@ -270,15 +261,16 @@ class MomentKeeper:
 
     def _begin_moment(
         self, wanted: SavedMoment, stored: StoredMoments, snapshot: Snapshot
-    ) -> StoredMoment:
-        """Begins a moment beside the `stored` ones.
+    ) -> StoredMoment | Refusal:
+        """Begins a moment beside the `stored` ones, or returns why it is refused.
 
         Raises:
-            _MomentRefusedError: it cannot be saved.
             OSError: it cannot be written; nothing of it is left.
         """
         need = needed_bags(wanted.request, snapshot, self.clock.now())
         share = self._share_to_begin(wanted, need, stored, snapshot)
+        if isinstance(share, Refusal):
+            return share
         folder = make_moment_folder(self.bag_dir, wanted.request)
         try:
             write_saved_moment(folder, wanted)
@@ -301,15 +293,14 @@ class MomentKeeper:
         need: NeededBags,
         stored: StoredMoments,
         snapshot: Snapshot,
-    ) -> Share:
+    ) -> Share | Refusal:
         """Returns the share that a new moment belongs to.
 
-        Raises:
-            _MomentRefusedError: there are too many moments, no bags, or too few bytes for it.
+        It is refused if there are too many moments, no bags, or too few bytes for it.
         """
         group = self._group(wanted, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self.rule_bytes)):
-            raise _MomentRefusedError(
+            return Refusal(
                 "number",
                 f"there are {len(group)} moments, the maximum; delete folders in "
                 "moments/ of the bag directory",
@@ -318,13 +309,13 @@ class MomentKeeper:
             thinned = snapshot.timeline.thinned_times
             if overlaps_any(thinned, need.window.start, need.window.stop - 1):
                 reason = "the bags of that time were deleted, and memory/ has what stayed of them"
-                raise _MomentRefusedError("deleted", reason)
+                return Refusal("deleted", reason)
             reason = "nothing was recorded then: ask for a time at which something was"
-            raise _MomentRefusedError("unrecorded", reason)
+            return Refusal("unrecorded", reason)
         share = self._share_of(wanted, stored)
         files = filter(None, (_file_of(bag.path) for bag in need.bags))
         if refused := share.refusal(files, sum(map(size_of, need.open_files))):
-            raise _MomentRefusedError("share", refused)
+            return Refusal("share", refused)
         return share
 
     def _continue_moment(

@@ -248,8 +248,8 @@ def chains_to_search(
         previous: returns the recording that one took over from, or None.
         split_ns: how long one bag is.
     """
-    ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
-    newest = {recording_of(part): part for part in closed if closed[part]}
+    ends = {part: max(bag.end for bag in bags) for part, bags in closed.items()}
+    newest = {recording_of(part): part for part in closed}
     written = {newest.get(name, name): ends.get(newest.get(name, "")) for name in live}
     limits = horizons(ends, written, split_ns)
     chains: list[SearchChain] = []
@@ -420,24 +420,21 @@ class SplitSearch:
         are opened one after the other. A part that cannot be read becomes a problem of the rules.
         """
         yield _Event(max(bag.start, part.window.start), "", recording_of(part.name), None)
-        watched: dict[str, tuple[Rule, ...]] = {}
-        for topic in bag.summary.topics:
-            if rules := self._rules_of(topic.topic):
-                watched[topic.topic] = rules
+        topics = {topic.topic for topic in bag.summary.topics if self._rules_of(topic.topic)}
         try:
-            yield from self._messages(bag, part, watched)
+            yield from self._messages(bag, part, topics)
         except BagError as error:
             if self._failing.may_recover(bag.path, error):
                 raise
             problem = f"not all could be searched: {bag.path.name}: {error.reason}"
-            for rules in watched.values():
-                for rule in rules:
+            for topic in topics:
+                for rule in self._rules_of(topic):
                     state.rules[rule.name].problem = problem
 
     def _messages(
-        self, bag: BagFile, part: SearchPart, watched: Mapping[str, Sequence[Rule]]
+        self, bag: BagFile, part: SearchPart, topics: Collection[str]
     ) -> Iterator[_Event]:
-        """Yields the messages of watched topics; without records if no rule tests their values.
+        """Yields the messages of topics, without records if no rule tests their values.
 
         Raises:
             BagError: the bag cannot be read.
@@ -445,8 +442,8 @@ class SplitSearch:
         latched = {topic.topic for topic in bag.summary.topics if topic.latched}
         read: list[str] = []
         times: list[tuple[Ns, str]] = []
-        for topic, rules in watched.items():
-            if topic in latched or any(rule.kind == "message" for rule in rules):
+        for topic in topics:
+            if topic in latched or any(rule.kind == "message" for rule in self._rules_of(topic)):
                 read.append(topic)
                 continue
             for batch in self.reader.batches(bag.path, [topic], part.window, bare=[topic]):

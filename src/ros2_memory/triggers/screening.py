@@ -125,7 +125,7 @@ class Screening:
         self._margin = max((rule.margin for rule in self.rules), default=0)
         self._lock = threading.Lock()
         self._state: ScreenState | None = None
-        self._problems: dict[str, str] = {}
+        self._problems: dict[Path, str] = {}
         self._refusals: dict[str, str] = {}
         self._evaluated: set[str] = set()
         self._logged_s: dict[str, float] = {}
@@ -168,11 +168,11 @@ class Screening:
         if not problems:
             refused = "; ".join(self.failing_rules())
             return f"recording.exclude_when does not work: {refused}" if refused else None
-        name, reason = problems[-1]
+        path, reason = problems[-1]
         held = counted(len(problems), "split is", "splits are")
         return (
             f"{held} not served, because recording.exclude_when could not be applied: "
-            f"{name}: {reason}"
+            f"{_file_name(path)}: {reason}"
         )
 
     def excluded_latched(self) -> frozenset[str]:
@@ -199,9 +199,9 @@ class Screening:
             is_held_back = is_held_back or not is_read
             # Values in a recording that is not read yet may matter to later ones.
             unreleased[name] = [] if is_held_back else files
-        for file in [*self._problems]:
-            if not (self.bag_dir / file).exists():
-                del self._problems[file]
+        for path in [*self._problems]:
+            if not path.exists():
+                del self._problems[path]
         self._commit(state, names)
         ready = self._ready(state, unreleased, live)
         stretches = self._stretches(state, live) if ready else []
@@ -229,7 +229,7 @@ class Screening:
             held = [stretch.span for stretch in older if stretch.held]
             state.earlier = _joined([*state.earlier, *(stretch.span for stretch in older)])
             state.earlier_held = _joined([*state.earlier_held, *held])
-        self._problems.pop(_file_name(path), None)
+        self._problems.pop(path, None)
         self._retry_s.pop(path, None)
 
     def _read_recording(
@@ -252,7 +252,7 @@ class Screening:
             try:
                 summary = self._read_file(path, screen)
             except _UselessRuleError as error:
-                self._problems |= dict.fromkeys(map(_file_name, paths[number:]), str(error))
+                self._problems |= dict.fromkeys(paths[number:], str(error))
                 self._put_off(path)
                 return unreleased, False
             if summary is not None:
@@ -286,7 +286,7 @@ class Screening:
             self._report(path, error)
             return None
         screen.files[path.name] = FileStep.READ
-        self._problems.pop(_file_name(path), None)
+        self._problems.pop(path, None)
         return summary
 
     def _is_put_off(self, path: Path) -> bool:
@@ -494,10 +494,10 @@ class Screening:
 
     def _report(self, path: Path, error: Exception) -> None:
         """Stores why a split is held back, and logs it once."""
-        name, reason = _file_name(path), reason_of(error)
-        if self._problems.get(name) != reason:
-            _log.error("split_held_back", file=name, reason=reason)
-        self._problems[name] = reason
+        reason = reason_of(error)
+        if self._problems.get(path) != reason:
+            _log.error("split_held_back", file=_file_name(path), reason=reason)
+        self._problems[path] = reason
 
 
 def _excluded_before(state: ScreenState) -> list[Excluded]:
