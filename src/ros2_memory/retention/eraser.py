@@ -351,11 +351,11 @@ class Eraser:
                 self.bag_dir, path, before, self.writer, takes=erasure.takes, expected=holder.counts
             ) as new:
                 for other in holder.paths[1:]:
-                    self._replace_link(new, other, holder.inode)
+                    self._replace_link(new, other, before)
             if os.fstat(old.fileno()).st_nlink:
                 # A recorder may have kept the old file in a moment meanwhile.
                 for late in filter(self._may_change, self._paths_of(holder.inode)):
-                    self._replace_link(path, late, holder.inode)
+                    self._replace_link(path, late, before)
             left = os.fstat(old.fileno()).st_nlink
         if left:
             links = counted(left, "more hard link", "more hard links")
@@ -365,11 +365,11 @@ class Eraser:
             flush(path.parent)
         return None
 
-    def _replace_link(self, new: Path, path: Path, inode: Identity) -> None:
+    def _replace_link(self, new: Path, path: Path, before: os.stat_result) -> None:
         """Puts a new file in place of one name of the old one."""
         with open_folder(self.bag_dir, path) as here, new_file_beside(here) as name:
             os.link(new, name, follow_symlinks=False)
-            replace_file(name, here, inode)
+            replace_file(name, here, before)
 
     def _clear_sidecar(self, path: Path, ids: Ids) -> None:
         """Takes messages of a file out of the sidecar in its folder.

@@ -455,11 +455,9 @@ def _oldest_first(
     )
     next_recorded = iter(recorded)
     by_path = {bag.path: bag for bag in contents.bags}
-    order: list[StoredBag] = []
-    for bag in by_date:
-        is_recorded = bag.recording in places
-        order.append(next(next_recorded) if is_recorded else by_path[bag.path])
-    return order
+    return [
+        next(next_recorded) if bag.recording in places else by_path[bag.path] for bag in by_date
+    ]
 
 
 def _outside_periods(bags: Sequence[StoredBag], *periods: _Period) -> Sequence[StoredBag]:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Identity = tuple[int, int]
 """A file by its device and inode number."""
-_CONTENT: Final = ("st_ino", "st_size", "st_mtime_ns")
+_CONTENT: Final = ("st_dev", "st_ino", "st_size", "st_mtime_ns")
 
 
 class Repaired(NamedTuple):
@@ -109,11 +109,7 @@ class Repairer:
         with new_file_beside(here) as new:
             result = self.writer.rewrite(here, new)
             _give_attributes(new, before, before.st_mtime_ns)
-            after = here.lstat()
-            if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
-                raise BagError(str(here), "it was written to while it was being repaired")
-            new.replace(here)
-        flush(here.parent)
+            replace_file(new, here, before)
         return Repaired(before.st_size, here.stat().st_size, result)
 
 
@@ -175,19 +171,19 @@ def rewrite_without(
             # A nanosecond later: nobody may take the new file for the old one.
             _give_attributes(new, before, before.st_mtime_ns + 1)
             yield new
-            replace_file(new, here, (before.st_dev, before.st_ino))
+            replace_file(new, here, before)
 
 
-def replace_file(new: Path, path: Path, inode: Identity) -> None:
-    """Renames a new file to `path`, where the file with `inode` must still lie.
+def replace_file(new: Path, path: Path, before: os.stat_result) -> None:
+    """Renames a new file to `path`, where the file must still be as it was `before`.
 
     Raises:
-        OSError: another file lies there, or none; or it was renamed, and the folder cannot be
-            flushed.
+        OSError: another file lies there, or none, or it was written to; or it was renamed, and the
+            folder cannot be flushed.
     """
-    status = path.lstat()
-    if (status.st_dev, status.st_ino) != inode:
-        raise OSError(f"{path.name} is not the file that was read")
+    after = path.lstat()
+    if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
+        raise OSError(f"{path.name} was written to meanwhile, or is another file")
     new.replace(path)
     flush(path.parent)
 

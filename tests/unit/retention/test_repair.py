@@ -75,7 +75,7 @@ def spoil_what_was_written(path: Path) -> None:
 @pytest.mark.parametrize(
     ("act", "told", "left"),
     [
-        (write_on, "written to while it was being repaired", ["a_0.mcap"]),
+        (write_on, "written to meanwhile", ["a_0.mcap"]),
         (partial(Path.unlink, missing_ok=True), "a_0.mcap", []),
         (spoil_what_was_written, "what was written is not", ["a_0.mcap"]),
     ],
