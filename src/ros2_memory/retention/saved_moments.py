@@ -203,9 +203,9 @@ class MomentKeeper:
     ) -> Outcome:
         """Returns the outcome of a request. A new moment begins, and is added to `stored`."""
         try:
-            moment = _moment_of(request, stored)
-            if moment is None:
-                moment = self._begin_moment(SavedMoment(request), stored, snapshot)
+            moment = _moment_of(request, stored) or self._begin_moment(
+                SavedMoment(request), stored, snapshot
+            )
         except OSError as error:
             folder = self.bag_dir / MOMENTS_FOLDER
             refused = f"the bags cannot be saved in {folder}: {error.strerror or error}"
