@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.analysis.sights import (
     SCORE_BINS,
     STOREY_MM,
@@ -257,17 +258,22 @@ def placed_stays(
 
 
 def end_where_carried_away(group: LabelGroup, observed: Observations) -> None:
-    """Ends the stays from which the robot took the thing along, if they were not seen to end."""
+    """Ends the stays from which the robot took the thing along.
+
+    It is nowhere else until the robot has put it down. What is near while the robot carries another
+    one past it was not taken.
+    """
     spots = observed.sights.spots[group.carried]
-    spots = spots[np.argsort(spots[:, Spot.FIRST])]
+    spots = spots[stable_order(spots[:, Spot.FIRST])]
+    starts, stops = pieces_of(spots[:, Spot.FIRST], spots[:, Spot.LAST], _TAKEN_NS)
+    taken = spots[np.searchsorted(spots[:, Spot.FIRST], starts)]
     for stay in group.stays:
-        nth = int(np.searchsorted(spots[:, Spot.FIRST], stay.last, side="right"))
-        if stay.left is not None or nth == len(spots):
+        nth = int(np.searchsorted(starts, stay.last, side="right"))
+        if nth == len(starts):
             continue
-        taken = spots[nth]
-        away_mm = math.hypot(taken[Spot.X] - stay.x, taken[Spot.Y] - stay.y)
-        if taken[Spot.FIRST] - stay.last <= _TAKEN_NS and away_mm <= _TAKEN_MM:
-            stay.left = int(taken[Spot.FIRST])
+        away_mm = math.hypot(taken[nth, Spot.X] - stay.x, taken[nth, Spot.Y] - stay.y)
+        if starts[nth] - stay.last <= _TAKEN_NS and away_mm <= _TAKEN_MM:
+            stay.left, stay.firm_last = int(starts[nth]), int(stops[nth])
 
 
 def remove_false_stays(

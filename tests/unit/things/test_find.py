@@ -768,6 +768,25 @@ def test_where_the_robot_passed_with_what_it_carries_is_no_place_of_it(tmp_path:
         assert changed == {}
 
 
+@pytest.mark.parametrize("in_sight_m", [3.0, 5.0])
+def test_a_thing_past_which_the_robot_carries_another_one_stays_where_it_is(
+    tmp_path: Path, in_sight_m: float
+) -> None:
+    """It picks a cup up at x = 2, carries it past a cup at x = 8, and puts it down at x = 12.1."""
+    taken, stands = ("cup", 2.0, 0.1), ("cup", 8.0, 0.8)
+
+    def held_and_beside(x: float) -> list[Seen]:
+        held = ("cup", x + 0.6, 0.05)
+        return [held, stands] if 0.3 < stands[1] - x < in_sight_m else [held]
+
+    carries = drive(30, 1.0, held_and_beside)
+    put_down = looked(51, 80, (11.0, 0.0, 0.0), ("cup", 12.1, 0.1))
+    found = told_of(tmp_path, [*looked(0, 30, HERE, taken), *carries, *put_down], label="cup")
+    places = [[stay["place"]["x"] for stay in cup.get("moved", ())] for cup in found["things"]]
+    assert places == [pytest.approx([2.0, 12.1], abs=0.05), []]
+    assert found["things"][1]["place"]["x"] == pytest.approx(8.0, abs=0.05)
+
+
 def test_a_thing_that_the_robot_took_along_is_one_though_nobody_looked_back(tmp_path: Path) -> None:
     """It grasps a cup before it, turns with it, drives to x = -9, and puts it down there."""
     messages = looked(0, 40, HERE, ("cup", 1.9, 0.0))
