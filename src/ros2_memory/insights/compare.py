@@ -66,7 +66,6 @@ from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay, most
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import (
-    Scattered,
     describe_hung,
     look_alike_notes,
     note_undecoded,
@@ -369,20 +368,19 @@ class _ThingsBetween:
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers), moves
 
-    def scattered(self, compared: ComparedThings) -> Iterator[Scattered]:
-        """Yields the things of the labels of which one came or went, as of the newest detections.
+    def scattered(self, compared: ComparedThings) -> Iterator[tuple[Instance, PlacedStay]]:
+        """Yields the things of the labels of which one came or went, with their last stays.
 
         They are as many as a note can look through.
         """
         came_or_went = (*compared.appeared, *compared.not_seen_where_expected)
         labels = {thing.label for thing in (*came_or_went, *compared.not_looked_at)}
         of_labels = (
-            instance for instance in self.known.estimate.instances if instance.label in labels
+            (instance, instance.stays[-1])
+            for instance in self.known.estimate.instances
+            if instance.label in labels
         )
-        for instance in islice(of_labels, _MOST_SCATTERED):
-            stay = instance.stays[-1]
-            frame = self.known.frames[instance.epoch]
-            yield Scattered(instance.label, frame, stay.at, stay.dev_mm / 1000)
+        return islice(of_labels, _MOST_SCATTERED)
 
     def _is_inside(self, instance: Instance, stay: _StayInWindow | None) -> bool:
         """Returns whether a thing has a stay in the region."""

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -36,7 +36,6 @@ from ros2_memory.things.instances import (
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import (
-    Scattered,
     ThingsQuestion,
     describe_hung,
     look_alike_notes,
@@ -142,7 +141,11 @@ def find_things(
         notes=(
             *view.notes.sentences(),
             *notes_on(view, known.by_all, question),
-            *scatter_notes(_standing(shown)),
+            *scatter_notes(
+                (thing.thing, thing.stays[-1][-1].stay)
+                for thing in found[:limit]
+                if isinstance(thing.thing, Instance)
+            ),
         ),
     )
 
@@ -152,13 +155,6 @@ def _rightly_dated(view: View, window: TimeWindow) -> TimeWindow:
     begin, _ = window.asked()
     ahead_from = view.snapshot.dating.ahead_from
     return TimeWindow(window.start, ahead_from) if begin < ahead_from else window
-
-
-def _standing(things: Iterable[Thing]) -> Iterator[Scattered]:
-    """Yields the places of the things that did not move."""
-    for thing in things:
-        if not thing.moves:
-            yield Scattered(thing.label, thing.frame_id, thing.place, thing.spread_m)
 
 
 def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
@@ -172,6 +168,13 @@ def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
     return odometry[-1] if odometry else ""
 
 
+class _StayInWindow(NamedTuple):
+    """A stay of a thing, and the spots of it that were seen in the window."""
+
+    stay: PlacedStay
+    rows: Ints
+
+
 class _FoundThing(NamedTuple):
     """A thing that a question selects. It is described only if it is shown.
 
@@ -181,6 +184,8 @@ class _FoundThing(NamedTuple):
         place: where it was then (m, in the frame of its epoch).
         at_once: how many were seen there at once; None for one.
         rows: its spots in the window; `newest` are its spots at `place`.
+        stays: its stays in the window, in groups of consecutive stays at one place; none of people
+            and pets.
         also_at: for people and pets, the places (m) of the others in the newest slice.
         near_m: its distance from the point or the thing that `near` names.
     """
@@ -193,6 +198,7 @@ class _FoundThing(NamedTuple):
     at_once: int | None
     rows: Ints
     newest: Ints
+    stays: Sequence[Sequence[_StayInWindow]] = ()
     also_at: tuple[Vector3, ...] = ()
     near_m: float | None = None
 
@@ -286,13 +292,6 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
     )
 
 
-class _StayInWindow(NamedTuple):
-    """A stay of a thing, and the spots of it that were seen in the window."""
-
-    stay: PlacedStay
-    rows: Ints
-
-
 @dataclass(frozen=True, slots=True)
 class _Finder:
     """Selects the things of a question, and describes them.
@@ -324,24 +323,33 @@ class _Finder:
     def _keys_of(self, names: Iterable[str]) -> set[str]:
         return {self.known.labels.key(name) for name in names}
 
-    def _stays_in_window(self, instance: Instance) -> list[_StayInWindow]:
-        stays = []
+    def _stays_in_window(self, instance: Instance) -> list[list[_StayInWindow]]:
+        """Returns the stays that the window has seen, in groups at one place.
+
+        A stay that was seen to end also ends its group: the thing was taken away and brought back.
+        """
+        groups: list[list[_StayInWindow]] = []
+        last: PlacedStay | None = None
         for stay in instance.stays:
             rows = self.known.estimate.seen_in(stay.spots, self.window)
-            if len(rows):
-                stays.append(_StayInWindow(stay, rows))
-        return stays
+            if not len(rows):
+                continue
+            if last is None or last.place != stay.place or last.left is not None:
+                groups.append([])
+            groups[-1].append(_StayInWindow(stay, rows))
+            last = stay
+        return groups
 
     def _locate_instance(self, instance: Instance, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields a thing if the window has seen it, and it was inside the region at the end."""
         estimate, stays = self.known.estimate, self._stays_in_window(instance)
         if not stays:
             return
-        stay, newest = stays[-1]
+        stay, newest = stays[-1][-1]
         frame = self.known.frames[instance.epoch]
         if self.where is not None and not self.where.contains(frame, *stay.at[:2]):
             return
-        rows = np.concatenate([part.rows for part in stays])
+        rows = np.concatenate([part.rows for part in chain(*stays)])
         count = estimate.side_by_side(newest)
         yield _FoundThing(
             instance,
@@ -352,6 +360,7 @@ class _Finder:
             at_once=count if count > 1 else None,
             rows=rows,
             newest=newest,
+            stays=stays,
         )
 
     def _locate_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
@@ -400,27 +409,25 @@ class _Finder:
         )
         if isinstance(thing, Mover):
             return replace(shown, moves=True, usually=self._usual_places(frame, rows))
-        return self._with_history(shown, thing, rows)
+        return self._with_history(shown, thing, found)
 
     def moves(self, things: Iterable[_FoundThing]) -> Iterator[Move]:
         """Yields the moves of things from place to place in the window."""
         for found in things:
             if isinstance(found.thing, Instance):
-                groups = _grouped_by_place(self._stays_in_window(found.thing))
-                for before, after in pairwise(groups):
+                for before, after in pairwise(found.stays):
                     yield Move(found.thing, before[-1].stay, after[0].stay)
 
-    def _with_history(self, shown: Thing, instance: Instance, rows: Ints) -> Thing:
+    def _with_history(self, shown: Thing, instance: Instance, found: _FoundThing) -> Thing:
         """Returns a described thing with its names, its stays, and whether it is still there."""
-        stays = self._stays_in_window(instance)
-        newest = stays[-1]
+        newest = found.stays[-1][-1]
         moved = []
-        for group in _grouped_by_place(stays):
+        for group in found.stays:
             rows_there = np.concatenate([part.rows for part in group])
             place = group[-1].stay.at
             moved.append(self.known.describe_stay(rows_there, place, shown.frame_id, self.places))
         has_moved = len(moved) > 1
-        labels = self._count_names(rows)
+        labels = self._count_names(found.rows)
         misread = Counter[str]()
         for stay in instance.stays:
             misread.update(stay.misread_as)
@@ -431,7 +438,7 @@ class _Finder:
             spread_m=newest.stay.dev_mm / _MM,
             still_there=self._still_there(instance, newest),
             moved=tuple(moved) if has_moved else (),
-            usually=self._usual_places(shown.frame_id, rows) if has_moved else None,
+            usually=self._usual_places(shown.frame_id, found.rows) if has_moved else None,
         )
 
     def _count_names(self, rows: Ints) -> dict[str, int]:
@@ -497,18 +504,3 @@ class _Finder:
 def _commonest(counts: Counter[str], without: Collection[str]) -> tuple[str, ...]:
     others = [name for name in counts if name not in without]
     return tuple(sorted(others, key=lambda name: (-counts[name], name))[:_MOST_NAMES])
-
-
-def _grouped_by_place(stays: Sequence[_StayInWindow]) -> list[list[_StayInWindow]]:
-    """Returns stays in groups of consecutive stays at one place.
-
-    A stay that was seen to end also ends its group: the thing was taken away and brought back.
-    """
-    groups: list[list[_StayInWindow]] = []
-    last: PlacedStay | None = None
-    for part in stays:
-        if last is None or last.place != part.stay.place or last.left is not None:
-            groups.append([])
-        groups[-1].append(part)
-        last = part.stay
-    return groups

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, combinations, product
@@ -19,7 +20,7 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.refusals import fields_of_constant
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
-from ros2_memory.core.arrays import Columns, Ints, distinct_rows, numbered, rows_by
+from ros2_memory.core.arrays import Columns, Flags, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -37,7 +38,7 @@ from ros2_memory.core.text import (
     repeating,
     still_quoted,
 )
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.condition_hints import constants_named, position_frames, schemas_of
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
@@ -56,10 +57,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import Vector3
     from ros2_memory.history.conditions import Sought
     from ros2_memory.history.stored_message import StoredMessage
-    from ros2_memory.things.instances import Instance, Move
+    from ros2_memory.things.instances import Instance, Move, PlacedStay
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
@@ -107,34 +107,52 @@ class ThingsQuestion(NamedTuple):
 
 
 class _LabelDetections(NamedTuple):
-    """How often a label was detected in a window.
+    """What was detected of a label in a window.
 
     Attributes:
-        counted: detections that count.
-        low: detections with too low a score.
-        carried: detections while the robot carried it.
-        last_carried: their last log time (ns), if none that counts is later; else `MIN_NS`.
-        unplaced: detections without a place.
-        first_unplaced, last_unplaced: their first and last log time (ns).
-        last_placed: the last log time (ns) of a detection with a place.
-        at_once: how many were seen at once.
+        name: the name to show.
+        spots: rows of `Spot`; `counts` has how many detections of each count.
+        is_carried: which spots are of what the robot carried.
+        lost: the detections without a place, as rows of `Unplaced`.
     """
 
     name: str
-    counted: int
-    low: int
-    carried: int
-    last_carried: Ns
-    unplaced: int
-    first_unplaced: Ns
-    last_unplaced: Ns
-    last_placed: Ns
-    at_once: int
+    spots: Ints
+    counts: Ints
+    is_carried: Flags
+    lost: Ints
+
+    @property
+    def counted(self) -> int:
+        """How many detections count."""
+        return int(self.counts.sum())
+
+    @property
+    def carried(self) -> int:
+        """How often it was detected while the robot carried it."""
+        return int(self.spots[self.is_carried, Spot.N].sum())
+
+    @property
+    def low(self) -> int:
+        """How many detections have too low a score."""
+        return int(self.spots[~self.is_carried, Spot.N].sum()) - self.counted
+
+    @property
+    def unplaced(self) -> int:
+        """How many detections have no place."""
+        return int(self.lost[:, Unplaced.N].sum())
 
     @property
     def total(self) -> int:
         """How often it was detected."""
-        return self.counted + self.low + self.carried + self.unplaced
+        return int(self.spots[:, Spot.N].sum()) + self.unplaced
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the robot carried it, and no detection since then counts."""
+        last = self.spots[:, Spot.LAST]
+        counting = last[self.counts > 0].max(initial=MIN_NS)
+        return bool(last[self.is_carried].max(initial=MIN_NS) > counting)
 
 
 def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
@@ -373,24 +391,21 @@ def vague_notes(
         )
 
 
-class Scattered(NamedTuple):
-    """A thing in a reply, with how far (m) its detections scatter around its place (m)."""
+def scatter_notes(stays: Iterable[tuple[Instance, PlacedStay]]) -> Iterator[str]:
+    """Yields for a label whether two of its things are so near that noise may have parted them.
 
-    label: str
-    frame_id: str
-    place: Vector3
-    spread_m: float
-
-
-def scatter_notes(things: Iterable[Scattered]) -> Iterator[str]:
-    """Yields for a label whether two of its things are so near that noise may have parted them."""
+    Each thing comes with its stay. Those of different runs of odometry cannot be compared.
+    """
+    alike: dict[tuple[str, int], list[PlacedStay]] = defaultdict(list)
+    for thing, stay in stays:
+        alike[thing.label, thing.epoch].append(stay)
     nearest: dict[str, tuple[float, float]] = {}
-    for one, other in combinations(things, 2):
-        if (one.label, one.frame_id) != (other.label, other.frame_id):
-            continue
-        away_m, spread_m = math.dist(one.place, other.place), max(one.spread_m, other.spread_m)
-        if away_m <= _SCATTERS * spread_m:
-            nearest[one.label] = min((away_m, spread_m), nearest.get(one.label, (math.inf, 0.0)))
+    for (label, _), stays_of_label in alike.items():
+        for one, other in combinations(stays_of_label, 2):
+            away_m = math.dist(one.at, other.at)
+            spread_m = max(one.dev_mm, other.dev_mm) / 1000
+            if away_m <= _SCATTERS * spread_m:
+                nearest[label] = min((away_m, spread_m), nearest.get(label, (math.inf, 0.0)))
     for label, (away_m, spread_m) in nearest.items():
         yield repeating(
             f"{label}: two of these are only {away_m:.2f} m apart, where detections of it scatter "
@@ -447,13 +462,15 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
     yield from _too_many_labels_note(known)
     for window in windows:
         labels = _detections_of(known, sorted(known.estimate.names), window).values()
-        unplaced = [
-            f"{label.name} ({counted(label.unplaced, 'time')}, "
-            f"from {unix_text(label.first_unplaced)} to {unix_text(label.last_unplaced)})"
-            for label in labels
-            if label.last_unplaced > label.last_placed + SLICE_NS
-        ]
-        crowded = [label.name for label in labels if label.at_once > MAX_SPOTS]
+        unplaced, crowded = [], []
+        for label in labels:
+            if label.spots[:, Spot.TOGETHER].max(initial=0) > MAX_SPOTS:
+                crowded.append(label.name)
+            last = int(label.lost[:, Unplaced.LAST].max(initial=MIN_NS))
+            if last > label.spots[:, Spot.LAST].max(initial=MIN_NS) + SLICE_NS:
+                first = int(label.lost[:, Unplaced.FIRST].min())
+                when = f"from {unix_text(first)} to {unix_text(last)}"
+                unplaced.append(f"{label.name} ({counted(label.unplaced, 'time')}, {when})")
         if crowded:
             yield repeating(
                 f"of more than {MAX_SPOTS} at once, the others are left out: "
@@ -515,28 +532,18 @@ def _detections_of(
     lost_then = _rows_during(window, estimate.unplaced, Unplaced.FIRST, Unplaced.LAST)
     unplaced = estimate.unplaced[lost_then]
     names, key_of_label = numbered(map(known.labels.key, estimate.labels))
+    placed_of = rows_by(key_of_label[estimate.spots[during, Spot.LABEL]], len(names))
+    lost_of = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(names))
     number_of = {key: number for number, key in enumerate(names)}
-    rows_of = rows_by(key_of_label[estimate.spots[during, Spot.LABEL]], len(names))
-    unplaced_rows_of = rows_by(key_of_label[unplaced[:, Unplaced.LABEL]], len(names))
     detections: dict[str, _LabelDetections] = {}
     for key in keys:
-        number = number_of[key]
-        rows, lost = during[rows_of[number]], unplaced[unplaced_rows_of[number]]
-        spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
-        carried, counting = estimate.carried[rows], estimate.counts[rows] > 0
-        last_carried = int(spots[carried, Spot.LAST].max(initial=MIN_NS))
-        is_newest = last_carried > int(spots[counting, Spot.LAST].max(initial=MIN_NS))
+        rows = during[placed_of[number_of[key]]]
         detections[key] = _LabelDetections(
-            name=estimate.names[key],
-            counted=count,
-            low=int(spots[~carried, Spot.N].sum()) - count,
-            carried=int(spots[carried, Spot.N].sum()),
-            last_carried=last_carried if is_newest else MIN_NS,
-            unplaced=int(lost[:, Unplaced.N].sum()),
-            first_unplaced=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
-            last_unplaced=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
-            last_placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
-            at_once=int(spots[:, Spot.TOGETHER].max(initial=0)),
+            estimate.names[key],
+            estimate.spots[rows],
+            estimate.counts[rows],
+            estimate.carried[rows],
+            unplaced[lost_of[number_of[key]]],
         )
     return detections
 
@@ -573,11 +580,12 @@ def _detection_notes(
     if unplaced:
         lost = counted(unplaced, "detection")
         yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
-    if in_window.last_carried > MIN_NS:
+    if in_window.is_held:
         times = counted(in_window.carried, "time")
+        last = int(in_window.spots[in_window.is_carried, Spot.LAST].max())
         yield (
-            f"it was seen {times}, last at {unix_text(in_window.last_carried)}, to go along with "
-            "the robot, as what it carries: that is no place of it"
+            f"it was seen {times}, last at {unix_text(last)}, to go along with the robot, as what "
+            "it carries: that is no place of it"
         )
     if key in question.found:
         return

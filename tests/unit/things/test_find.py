@@ -223,6 +223,21 @@ def test_things_that_are_nearer_to_each_other_than_noise_throws_detections_are_t
     assert ("they may be one thing" in str(compared["notes"])) == is_told
 
 
+def test_things_of_two_runs_of_odometry_are_not_said_to_be_near_each_other(tmp_path: Path) -> None:
+    """The same coordinates are another place in each run."""
+    noise = Random(3)
+    for run in range(2):
+        cups = (("cup", noise.gauss(3.0, 0.1), noise.gauss(0.0, 0.1)) for _ in range(60))
+        messages = (
+            scene(1000 * run + at, HERE, [cup], in_map=False) for at, cup in enumerate(cups)
+        )
+        write_splits(tmp_path / str(run), [*chain.from_iterable(messages)])
+    found = ask(tmp_path, label="cup")
+    assert found["total"] == 2
+    assert "each run of odometry has its own coordinates" in str(found["notes"])
+    assert "may be one thing" not in str(found["notes"])
+
+
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
     for name, robot in (("wren", HERE), ("robin", (5.0, 0.0, 0.0))):
         seen = looked(0, 60, robot, ("cup", 3.0, 0.0))
