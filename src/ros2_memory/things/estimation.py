@@ -175,7 +175,9 @@ def _add_places(groups: Sequence[LabelGroup], observed: Observations) -> None:
     if not single:
         return
     thing = range_numbers([len(rows) for _, rows in single])
-    steps = stays_in(observed.sightings(np.concatenate([rows for _, rows in single])), thing)
+    rows = np.concatenate([rows for _, rows in single])
+    spots = observed.sights.spots[rows]
+    steps = stays_in(spots, observed.counts[rows], observed.side[rows], thing)
     for (group, rows), step in zip(single, steps, strict=True):
         group.places += [rows[step == number] for number in range(int(step.max()) + 1)]
 
@@ -183,8 +185,9 @@ def _add_places(groups: Sequence[LabelGroup], observed: Observations) -> None:
 def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tuple[Ints, bool]]:
     """Yields the spots at each place, and whether several things of the label stand there."""
     rows = observed.firm(group.rows)
+    spots = observed.sights.spots
     names = (Spot.X, Spot.Y, Spot.Z, Spot.SLICE)
-    x, y, z, slices = (observed.sights.spots[rows, name] for name in names)
+    x, y, z, slices = (spots[rows, name] for name in names)
     place = np.full(len(rows), -1, np.int64)
     # A floor ends where heights leave a gap.
     by_height = stable_order(z)
@@ -193,8 +196,9 @@ def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tupl
         on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
         place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
-    pairs, pair_of = distinct_rows((place, observed.groups[rows]))
-    are_shared = _are_shared(pairs[:, 0], np.bincount(pair_of))
+    of_message = (spots[rows, name] for name in (Spot.SLICE, Spot.TOPIC, Spot.LABEL))
+    seen_at, number = distinct_rows((place, *of_message))
+    are_shared = _are_shared(seen_at[:, 0], np.bincount(number))
     for number, positions in enumerate(rows_by(place, len(are_shared))):
         yield rows[positions], bool(are_shared[number])
 

@@ -42,8 +42,8 @@ class PlacedStay:
             from it.
         first, last: log times of the detections (ns); `firm_first` and `firm_last` are those of
             the detections beyond doubt.
-        left: when it was seen to be gone (ns); None if it was not.
         count: how many detections.
+        left: when it was seen to be gone (ns); None if it was not.
         spots: rows of `Sights.spots`, in order of time.
         place: the number of the place.
         stay: the slices of the stay.
@@ -59,8 +59,8 @@ class PlacedStay:
     last: Ns
     firm_first: Ns
     firm_last: Ns
-    left: Ns | None
     count: int
+    left: Ns | None
     spots: Ints
     place: int
     stay: Stay

@@ -194,23 +194,6 @@ _USUAL: Final = 8
 """The usual variance weighs as much as this many looks, or differences between visits."""
 
 
-class Sightings(NamedTuple):
-    """Sightings of things; each thing has at least one, in order of time.
-
-    Attributes:
-        xy: the mean place of `n` looks (mm); `dev` is their root mean square distance from it.
-        side: the mean unit vector from the robot to the place; 0 if that is unknown.
-        first, last: log times of the first and the last look (ns).
-    """
-
-    xy: Floats
-    n: Ints
-    dev: Ints | Floats
-    side: Floats
-    first: Ints
-    last: Ints
-
-
 def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     """Returns the number of each sighting's visit. Things are in ascending order."""
     things = np.broadcast_to(thing, len(last))
@@ -219,12 +202,16 @@ def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     return np.concatenate(([0], np.cumsum(begins)))
 
 
-def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
-    """Returns the stay of each sighting, numbered from 0 for each thing.
+def stays_in(spots: Ints, n: Ints, side: Floats, thing: Ints) -> list[Ints]:
+    """Returns the stay of each sighting of some things, numbered from 0 for each thing.
 
-    `thing` has the number of each sighting's thing, in order, without a gap.
+    Args:
+        spots: rows of `Spot`, of each thing at least one, in order of time.
+        n: how many looks of each count.
+        side: the mean unit vector from the robot to the place; 0 if that is unknown.
+        thing: the number of each sighting's thing, in order, without a gap.
     """
-    series = _Series.of(sightings, thing)
+    series = _Series.of(spots, n, side, thing)
     begins = run_starts(series.thing)
     variance = _visit_variances(_differences(series))
     stays = np.cumsum(_are_moved(series, variance))
@@ -245,17 +232,18 @@ class _Series(NamedTuple):
     thing: Ints
 
     @classmethod
-    def of(cls, sightings: Sightings, thing: Ints) -> _Series:
-        xy, n, dev, side, first, last = sightings
+    def of(cls, spots: Ints, n: Ints, side: Floats, thing: Ints) -> _Series:
+        xy = spots[:, [Spot.X, Spot.Y]]
         sizes = np.bincount(thing)
         begins = np.cumsum(sizes) - sizes
-        squares = n * dev**2 / 2
+        squares = n * spots[:, Spot.DEV] ** 2 / 2
         looks = np.add.reduceat(n, begins) - sizes + _USUAL
         usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks
         weight = n * (n - 1 + _USUAL) / (squares + _USUAL * usual[thing])
         place = xy - (np.add.reduceat(xy, begins) / sizes[:, None])[thing]
         columns = np.vstack((np.ones(len(weight)), side.T, place.T)) * weight
-        return cls(columns, n, visits_of(first, last, thing), thing)
+        visit = visits_of(spots[:, Spot.FIRST], spots[:, Spot.LAST], thing)
+        return cls(columns, n, visit, thing)
 
 
 def _differences(series: _Series) -> list[Floats]:

@@ -262,20 +262,12 @@ class Evidence(NamedTuple):
 
     def at_place(self, place: int) -> Evidence:
         """Returns the evidence of the looks at one place, without its number in their keys."""
-        ends = np.array([place, place + 1]) << _BITS
-        looks = slice(*np.searchsorted(self.looks, ends).tolist())
+        own = slice(*np.searchsorted(self.looks, np.array([place, place + 1]) << _BITS).tolist())
+        columns = (_number(self.looks[own]), self.cell[own], self.n[own], self.hits[own])
         none = self.blind[:0]
-        return Evidence(
-            looks=narrowed(_number(self.looks[looks])),
-            cell=narrowed(self.cell[looks]),
-            n=narrowed(self.n[looks]),
-            hits=narrowed(self.hits[looks]),
-            blind=none,
-            times=none,
-            # Copied, so that the evidence of all other places is freed.
-            sees=self.sees[looks].copy(),
-            fair=self.fair[looks].copy(),
-        )
+        # Copied, so that the evidence of all other places is freed.
+        flags = (self.sees[own].copy(), self.fair[own].copy())
+        return Evidence(*map(narrowed, columns), none, none, *flags)
 
 
 class Looks(NamedTuple):
@@ -464,7 +456,7 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     slices, odds = by_slice.slices, by_slice.odds
     start, stop = _runs_of_presence(odds, _place(slices))
     run, rows = range_numbers(stop - start), in_ranges(start, stop - start)
-    has_hits = by_slice.hits[rows] > 0
+    has_hits = by_slice.counts[0, rows] > 0
     run, rows = run[has_hits], rows[has_hits]
     if not len(rows):
         return
@@ -474,27 +466,16 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     clearest = np.repeat(by_run.ends(clearness)[1], by_run.sizes)
     first, last = _run_ends(run, rows, clearness >= np.minimum(clearest, 2))
     firm_first, firm_last = _run_ends(run, rows, clearness >= clearest)
-    first_slice, last_slice, firm_from, firm_to = (
-        _number(slices[ends]).tolist() for ends in (first, last, firm_first, firm_last)
-    )
-    sums = [np.append(0, np.cumsum(count)).astype(np.int64) for count in by_slice.counts]
-    hits, clear_hits, messages = ((count[last + 1] - count[first]).tolist() for count in sums)
+    own_slices = [_number(slices[ends]) for ends in (first, last, firm_first, firm_last)]
+    before = np.pad(np.cumsum(by_slice.counts, axis=1), ((0, 0), (1, 0)))
+    counts = before[:, last + 1] - before[:, first]
     place = _place(slices[first])
-    next_place = np.searchsorted(slices, (place + 1) << _BITS)
-    for nth, number in enumerate(place.tolist()):
-        end = int(firm_last[nth]) + 1
-        is_gone = np.cumsum(odds[end : next_place[nth]]) < math.log(_LEFT_BY_CHANCE)
-        stay = Stay(
-            first_slice=first_slice[nth],
-            last_slice=last_slice[nth],
-            firm_first=firm_from[nth],
-            firm_last=firm_to[nth],
-            hits=hits[nth],
-            clear_hits=clear_hits[nth],
-            messages=messages[nth],
-            left=int(_number(slices[end + is_gone.argmax()])) if is_gone.any() else None,
-        )
-        yield number, stay
+    begin, end = firm_last + 1, np.searchsorted(slices, (place + 1) << _BITS)
+    columns = (place, begin, end, *own_slices, *counts)
+    for number, after, stop, *row in zip(*(column.tolist() for column in columns), strict=True):
+        is_gone = np.cumsum(odds[after:stop]) < math.log(_LEFT_BY_CHANCE)
+        left = int(_number(slices[after + is_gone.argmax()])) if is_gone.any() else None
+        yield number, Stay(*row, left)
 
 
 def _run_ends(run: Ints, rows: Ints, which: Flags) -> tuple[Ints, Ints]:
@@ -509,20 +490,13 @@ class _SliceEvidence(NamedTuple):
     Attributes:
         slices: the places and slices, as keys in order.
         odds: the natural logarithm of the odds that the label was there.
-        hits: the detections; `clear_hits` are those from cells that see the place.
-        messages: the messages of the looks with hits.
+        counts: the detections, those from cells that see the place, and the messages of the looks
+            with hits, as three rows.
     """
 
     slices: Ints
     odds: Floats
-    hits: Ints
-    clear_hits: Ints
-    messages: Ints
-
-    @property
-    def counts(self) -> tuple[Ints, Ints, Ints]:
-        """The columns that add up over slices."""
-        return self.hits, self.clear_hits, self.messages
+    counts: Ints
 
 
 def _slice_evidence(cells: Cells, evidence: Evidence) -> _SliceEvidence:
@@ -531,16 +505,13 @@ def _slice_evidence(cells: Cells, evidence: Evidence) -> _SliceEvidence:
     slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
     hit = np.flatnonzero(evidence.hits)  # a few of all looks
     weights = evidence.hits[hit], evidence.hits[hit] * evidence.sees[hit], evidence.n[hit]
-    counts = [np.bincount(slice_of[hit], weight, len(slices)) for weight in weights]
-    for count in counts:
-        count[blind] += evidence.times
-    hits, clear_hits, messages = counts
-    look_odds = _look_odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
+    sums = [np.bincount(slice_of[hit], weight, len(slices)) for weight in weights]
+    counts = np.array(sums, np.int64)
+    counts[:, blind] += evidence.times
+    look_odds = _look_odds(cells, evidence, hit, np.flatnonzero((counts[0] > 0)[slice_of]))
     odds = np.bincount(slice_of, look_odds, len(slices)).astype(np.float64)
     odds[blind] += _UNPLACED_HIT * evidence.times
-    return _SliceEvidence(
-        slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, clear_hits, messages
-    )
+    return _SliceEvidence(slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), counts)
 
 
 def _look_odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:

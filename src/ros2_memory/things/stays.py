@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -28,7 +29,7 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
-    distinct_rows,
+    concatenated,
     in_ranges,
     numbered,
     range_numbers,
@@ -39,11 +40,11 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.things.carried import carried_spots
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
 from ros2_memory.things.labels import moves_by_itself
-from ros2_memory.things.places import Sightings, poorly_localised
+from ros2_memory.things.places import poorly_localised
 from ros2_memory.things.presence import Cells, Evidence, Stay, half_turns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.things.labels import Labels
@@ -105,7 +106,6 @@ class Observations:
         carried: which spots are of carried things.
         poor: which spots were seen while localisation was poor: they move nothing.
         hits: the looks of detections that count, by spot; -1 where localisation was poor.
-        groups: a number for each spot, equal for spots of one slice, topic and label.
         fields: the field of view of each topic; see `_fields_of_view`.
         side: for each spot, the mean of the unit vectors to it from where it was seen; 0 if that
             is unknown.
@@ -132,8 +132,6 @@ class Observations:
         look[np.append(poor_looks, [False])[look]] = -1
         spot, look, n = (column[n > 0] for column in (spot, look, n))
         self.hits = Tally.of(len(spots), spot, look, n)
-        names = (Spot.SLICE, Spot.TOPIC, Spot.LABEL)
-        _, self.groups = distinct_rows([spots[:, name] for name in names])
         self.cells = Cells(sights, poor_looks)
         spot, look, n = (column[look >= 0] for column in (spot, look, n))
         distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
@@ -149,13 +147,6 @@ class Observations:
         good: Ints = rows[~self.poor[rows]]
         return good if self.counts[good].sum() >= FEWEST else rows
 
-    def sightings(self, rows: Ints) -> Sightings:
-        """Returns spots as sightings."""
-        names = (Spot.X, Spot.Y, Spot.DEV, Spot.FIRST, Spot.LAST)
-        x, y, dev, *times = (self.sights.spots[rows, name] for name in names)
-        place = np.stack((x, y), axis=1, dtype=np.float64)
-        return Sightings(place, self.counts[rows], dev, self.side[rows], *times)
-
 
 def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
     """Returns how far (mm) each detector sees, in which direction, and how far to both sides of it.
@@ -168,20 +159,14 @@ def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, top
     toward = np.exp(1j * np.radians(bearing))
     for number in np.flatnonzero(np.bincount(topic)).tolist():
         rows = topic == number
-        [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
+        quantile = partial(np.quantile, weights=n[rows], method="inverted_cdf")
+        far = quantile(distance[rows], 1 - _VIEW_SHARE)
         # A camera that looks back sees from 150 to -150 degrees, not all between.
         middle = round(np.degrees(np.angle(toward[rows] @ n[rows])))
         beside = half_turns(bearing[rows] - middle)
-        sides = _weighted_quantiles(beside, n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
+        sides = quantile(beside, [_VIEW_SHARE, 1 - _VIEW_SHARE])
         fields[number] = far, middle, *sides
     return fields
-
-
-def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> Floats:
-    order = np.argsort(values)
-    running = np.cumsum(n[order])
-    quantiles: Floats = values[order][np.searchsorted(running, np.multiply(shares, running[-1]))]
-    return quantiles
 
 
 def lowest_bin(min_score: float) -> int:
@@ -236,24 +221,20 @@ def placed_stays(
     firm_first = np.minimum.reduceat(np.where(is_firm, first, MAX_NS), begins)
     firm_last = np.maximum.reduceat(np.where(is_firm, last, -MAX_NS), begins)
     first, last = np.minimum.reduceat(first, begins), np.maximum.reduceat(last, begins)
+    columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count)
+    numbers = zip(*(column.tolist() for column in columns), strict=True)
     return [
         PlacedStay(
-            x=float(x[number]),
-            y=float(y[number]),
-            z=float(z[number]),
-            dev_mm=float(dev_mm[number]),
-            first=int(first[number]),
-            last=int(last[number]),
-            firm_first=int(firm_first[number]),
-            firm_last=int(firm_last[number]),
+            *row,
             left=None if stay.left is None else observed.cells.looked_in(stay.left),
-            count=int(count[number]),
-            spots=rows[begins[number] : begins[number] + sizes[number]],
+            spots=own_rows,
             place=place,
             stay=stay,
             weak=stay.clear_hits < FEWEST or stay.hits < _LOWEST_RATE * stay.messages,
         )
-        for number, (place, stay) in enumerate(stays)
+        for (place, stay), own_rows, row in zip(
+            stays, np.split(rows, begins[1:]), numbers, strict=True
+        )
     ]
 
 
@@ -317,22 +298,28 @@ class _HostSearch:
         self._observed = observed
         # Columns of the stays.
         self._keys, self._key_of_label = numbered(keys)
-        self._key = _column(self._keys.index(group.key) for group, _ in stays)
-        self._epoch = _column(group.epoch for group, _ in stays)
-        placed = [stay for _, stay in stays]
-        self._count = _column(stay.count for stay in placed)
-        self._first = _column(stay.first for stay in placed)
-        self._last = _column(stay.last for stay in placed)
-        self._dev_mm = np.array([stay.dev_mm for stay in placed], np.float64)
-        self._is_weak = _column(stay.weak for stay in placed) > 0
-        self._first_slice = _column(stay.stay.first_slice for stay in placed)
-        self._last_slice = _column(stay.stay.last_slice for stay in placed)
-        places = np.array([(stay.x, stay.y, stay.z) for stay in placed], np.float64)
-        self._places = places.reshape(-1, 3).T
+        integers = [
+            (
+                self._keys.index(group.key),
+                group.epoch,
+                stay.count,
+                stay.first,
+                stay.last,
+                stay.stay.first_slice,
+                stay.stay.last_slice,
+                stay.weak,
+            )
+            for group, stay in stays
+        ]
+        columns = np.array(integers, np.int64).reshape(-1, 8).T
+        self._key, self._epoch, self._count, self._first, self._last = columns[:5]
+        self._first_slice, self._last_slice, self._is_weak = columns[5:]
+        places = np.array([(stay.x, stay.y, stay.z, stay.dev_mm) for _, stay in stays], np.float64)
+        *self._places, self._dev_mm = places.reshape(-1, 4).T
         self._by_x = stable_order(self._places[0])
         # Each spot's stay and slice as one number, in order; and how many detections are before it.
-        sizes = [len(stay.spots) for stay in placed]
-        self._rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in placed)])
+        sizes = [len(stay.spots) for _, stay in stays]
+        self._rows = concatenated(stay.spots for _, stay in stays)
         self._stay_of = range_numbers(sizes)
         spots = observed.sights.spots[self._rows]
         self._width = len(observed.sights.epochs) + 1
@@ -398,9 +385,5 @@ class _HostSearch:
         away = np.hypot(x[other] - x[one], y[other] - y[one])
         is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
         is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
-        is_near &= (self._epoch[other] == self._epoch[one]) & ~self._is_weak[other]
+        is_near &= (self._epoch[other] == self._epoch[one]) & (self._is_weak[other] == 0)
         return one[is_near], other[is_near], away[is_near]
-
-
-def _column(values: Iterable[int]) -> Ints:
-    return np.array([*values], np.int64)

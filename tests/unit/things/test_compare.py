@@ -8,9 +8,10 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
+from ros2_memory.analysis.sights import Floats, Spot
 from ros2_memory.core.arrays import Ints
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.things.places import Sightings, stays_in
+from ros2_memory.things.places import stays_in
 from tests.support.bags import (
     Msg,
     detected,
@@ -140,6 +141,10 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
 LABELS: Final = ("mug", "book", "lamp", "bag", "vase", "radio", "plant", "clock")
 
 
+Thing = tuple[Ints, Floats]
+"""Rows of `Spot`, and from which side each was seen."""
+
+
 # -- sightings, in many worlds -------------------------------------------------------------------
 
 
@@ -150,27 +155,29 @@ def sightings(
     visit_mm: float = 0.0,
     bias_mm: float = 0.0,
     sides: int = 2,
-) -> Sightings:
+) -> Thing:
     """A thing at a place (mm) by visit, two a day, each of two bags with ten looks."""
-    xy, dev, side, first = [], [], [], []
+    spots, side = [], []
     for nth, place in enumerate(places):
         angle = draw.integers(sides) * 2 * math.pi / sides
         view = np.array([math.cos(angle), math.sin(angle)])
         off = np.array(place) + bias_mm * view + draw.normal(0, visit_mm, 2)
         for bag in range(2):
             looks = off + draw.normal(0, 50, (10, 2))
-            xy.append(looks.mean(axis=0))
-            dev.append(math.sqrt(((looks - xy[-1]) ** 2).sum(axis=1).mean()))
+            spot = np.zeros(len(Spot), np.int64)
+            spot[[Spot.X, Spot.Y]] = xy = looks.mean(axis=0)
+            spot[Spot.DEV] = math.sqrt(((looks - xy) ** 2).sum(axis=1).mean())
+            spot[Spot.FIRST] = (nth * 43_200 + bag * 10) * S
+            spot[Spot.LAST] = spot[Spot.FIRST] + 9 * S
+            spots.append(spot)
             side.append(view)
-            first.append((nth * 43_200 + bag * 10) * S)
-    begin = np.array(first)
-    n = np.full(len(begin), 10)
-    return Sightings(np.array(xy), n, np.array(dev), np.array(side), begin, begin + 9 * S)
+    return np.array(spots), np.array(side)
 
 
-def stays_of(things: list[Sightings]) -> list[Ints]:
-    together = Sightings(*map(np.concatenate, zip(*things, strict=True)))
-    return stays_in(together, np.repeat(np.arange(len(things)), [len(one.n) for one in things]))
+def stays_of(things: list[Thing]) -> list[Ints]:
+    spots, side = map(np.concatenate, zip(*things, strict=True))
+    thing = np.repeat(np.arange(len(things)), [len(one) for one, _ in things])
+    return stays_in(spots, np.full(len(spots), 10), side, thing)
 
 
 NOISE: Final = [
