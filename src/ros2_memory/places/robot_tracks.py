@@ -80,9 +80,6 @@ _READING_S: Final = 10.0
 """How long a call reads and places poses before it answers with those that it has."""
 
 
-_MOST_SETTINGS: Final = 256
-_SETTINGS: Final[Key[dict[tuple[object, ...], str]]] = Key()
-"""Remembered for a timeline: the hash of what places the poses of a stretch, by its parts."""
 _KNOWN: Final[Key[dict[tuple[str, TimeWindow], KnownTrack]]] = Key()
 """Remembered for a call: its tracks, by frame and window."""
 
@@ -229,19 +226,10 @@ class TrackReader:
         recording_of_part = self._moving_parts(moving, span)
         if recording_of_part is None:
             return None
-        known = self._view.timeline.memo.of(_SETTINGS, dict)
-        known_by = (self._settings_hash(()), stretch.parts, *recording_of_part)
-        settings = known.get(known_by)
+        recordings = [] if self._is_own else [*map(pose_scan.recording_of, stretch.parts)]
+        settings = self._stretch_settings(recordings, recording_of_part.values(), span)
         if settings is None:
-            recordings = [] if self._is_own else [*map(pose_scan.recording_of, stretch.parts)]
-            with self._view.bags.watched() as reading:
-                settings = self._stretch_settings(recordings, recording_of_part.values(), span)
-            if settings is None:
-                return None
-            if reading.is_final:
-                if len(known) >= _MOST_SETTINGS:
-                    known.clear()
-                known[known_by] = settings
+            return None
         others = (part for part in recording_of_part if part not in stretch.parts)
         return FragmentKey(start, settings, (*stretch.parts, *others))
 
