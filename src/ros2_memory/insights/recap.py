@@ -464,10 +464,10 @@ def _stop_events(stops: Iterable[Standstill], places: RobotPlaces | None) -> Ite
         x, y, _ = box.centre
         point: tuple[float, float] | None = (x, y)
         frame = ""
-        if places is not None and places.frame_id != places.pose_frame:
+        if places is not None and places.frame_id != places.placement.pose_frame:
             point = places.at(places.standstill_time(start, end))
             if point is None:
-                frame = f" in {places.pose_frame}"
+                frame = f" in {places.placement.pose_frame}"
             else:
                 x, y = point
         # z: a rounded -0.00 reads as 0.00.

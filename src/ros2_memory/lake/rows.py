@@ -51,7 +51,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_by_bag, toggle_sentence
 from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
-from ros2_memory.places.pose_frames import robot_places
+from ros2_memory.places.pose_frames import known_placement
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SightReader, may_have_detections
@@ -250,11 +250,11 @@ class RowMaker:
         is computed once, and cut; only if it cannot be, that in the bag's own window is.
         """
         window = TimeWindow(bag.start, bag.end + 1)
-        places = robot_places(self._view, window)
-        if places is None:
+        placement = known_placement(self._view)
+        if placement is None:
             return []
         tracks: list[tuple[str, RobotTrack]] = []
-        for frame in dict.fromkeys((places.map_frame, places.pose_frame)):
+        for frame in dict.fromkeys((placement.frame_id, placement.pose_frame)):
             reader = TrackReader(self._view, frame)
             for part in (around, window):
                 # Raised if a message of the part has no position.

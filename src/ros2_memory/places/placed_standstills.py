@@ -65,15 +65,6 @@ def _is_known(track: RobotTrack, times: Ints) -> Flags:
     return (piece >= 0) & (times <= stops[piece] + SILENCE_NS)
 
 
-class _PlaceStands(NamedTuple):
-    """A place (m), and the standstills there in each of two windows."""
-
-    x: float
-    y: float
-    this: list[PlacedStandstill]
-    other: list[PlacedStandstill]
-
-
 def stood_at(
     this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
 ) -> list[StandstillPlace]:
@@ -82,28 +73,20 @@ def stood_at(
     A place is where the robot stood longest, and gathers standstills within `SAME_STAND_M`. The
     names of places are left empty.
     """
-    stands = [*((stand, False) for stand in this), *((stand, True) for stand in other)]
-    stands.sort(key=lambda marked: (-marked[0].duration, marked[0]))
-    middles = np.empty((len(stands), 2))
-    places: list[_PlaceStands] = []
-    for stand, is_other in stands:
-        squared = ((middles[: len(places)] - (stand.x, stand.y)) ** 2).sum(axis=1)
+    stands = [*((stand, 0) for stand in this), *((stand, 1) for stand in other)]
+    stands.sort(key=lambda numbered: (-numbered[0].duration, numbered[0]))
+    middles, lasted = np.empty((len(stands), 2)), np.zeros((len(stands), 2), np.int64)
+    count = 0
+    for stand, window in stands:
+        squared = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
+        place = count
         if (squared <= SAME_STAND_M**2).any():
-            place = places[int(squared.argmin())]
+            place = int(squared.argmin())
         else:
-            middles[len(places)] = stand.x, stand.y
-            place = _PlaceStands(stand.x, stand.y, [], [])
-            places.append(place)
-        (place.other if is_other else place.this).append(stand)
+            middles[count] = stand.x, stand.y
+            count += 1
+        lasted[place, window] += stand.duration
     return [
-        StandstillPlace(
-            (place.x, place.y),
-            (),
-            Pair(_total_s(place.this), _total_s(place.other)),
-        )
-        for place in places
+        StandstillPlace((x, y), (), Pair(*map(unix_from_ns, lengths)))
+        for (x, y), lengths in zip(middles[:count].tolist(), lasted.tolist(), strict=False)
     ]
-
-
-def _total_s(stands: Iterable[PlacedStandstill]) -> float:
-    return unix_from_ns(sum(stand.duration for stand in stands))

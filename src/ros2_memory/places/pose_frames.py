@@ -478,35 +478,31 @@ class RobotPlaces:
     Attributes:
         view: the view of this call.
         window: the window.
-        frame_id: the frame of positions: the one that was asked for, or else `map_frame`.
-        pose_frame: the frame of the poses.
-        map_frame: the frame of places: the map if transforms lead there, else `pose_frame`.
-        frames: all frames in which positions are known.
+        frame_id: the frame of positions: the one that was asked for, or else that of places.
+        placement: the frames of the poses and of places.
     """
 
     view: View
     window: TimeWindow
     frame_id: str
-    pose_frame: str
-    map_frame: str
-    frames: tuple[str, ...]
+    placement: MapPlacement
     _tracks: dict[str, RobotTrack] = field(default_factory=dict)
 
     def at(self, time: Ns) -> tuple[float, float] | None:
-        """Returns where the robot was (x, y in m) in the map frame.
+        """Returns where the robot was (x, y in m) in the frame of places.
 
         None if the track does not reach the time, or if positions are asked for in another frame.
         """
-        if self.frame_id != self.map_frame:
+        if self.frame_id != self.placement.frame_id:
             return None
-        return self._place_at(time, self.map_frame)
+        return place_at(self._track_in(self.frame_id), time, SILENCE_NS)
 
     def standstill_time(self, start: Ns, end: Ns) -> Ns:
         """Returns the time that shows where the robot stood.
 
         The middle of the standstill, or its start if the map jumps meanwhile.
         """
-        times = self._track_in(self.map_frame).times
+        times = self._track_in(self.placement.frame_id).times
         first, last = np.searchsorted(times, (start, end)).tolist()
         return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
@@ -514,18 +510,15 @@ class RobotPlaces:
         """Returns the names of the places that the robot was in, the smallest place first."""
         inside: list[Place] = []
         for place in self.view.limits.places:
-            if place.frame_id in self.frames:
-                point = self._place_at(time, place.frame_id)
+            if place.frame_id in self.placement.frames:
+                point = place_at(self._track_in(place.frame_id), time, SILENCE_NS)
                 if point is not None and place.region.contains(*point):
                     inside.append(place)
         return names_by_size(inside)
 
     @cached_property
     def _jumps(self) -> Flags:
-        return jumps(self._track_in(self.map_frame))
-
-    def _place_at(self, time: Ns, frame_id: str) -> tuple[float, float] | None:
-        return place_at(self._track_in(frame_id), time, SILENCE_NS)
+        return jumps(self._track_in(self.placement.frame_id))
 
     def _track_in(self, frame_id: str) -> RobotTrack:
         if frame_id not in self._tracks:
@@ -562,4 +555,4 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
     if usual is None:
         return None
     asked = usual if frame_id is None else map_placement(view, resolve_path_topic(view), frame_id)
-    return RobotPlaces(view, window, asked.frame_id, usual.pose_frame, usual.frame_id, usual.frames)
+    return RobotPlaces(view, window, asked.frame_id, usual)

@@ -21,7 +21,7 @@ from ros2_memory.history.no_data import GIVE_TOPIC, resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.places.local_map import local_track
-from ros2_memory.places.pose_frames import robot_places
+from ros2_memory.places.pose_frames import known_placement
 from ros2_memory.places.robot_tracks import TrackReader
 
 if TYPE_CHECKING:
@@ -113,14 +113,16 @@ def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
     Raises:
         QueryTimeoutError: the call's time is over before any of it is known.
     """
-    places = robot_places(view, window)
-    if places is None:
+    placement = known_placement(view)
+    if placement is None:
         local = local_track(view, view.pose_topic, window)
         return None if local is None else RobotPath(*local, is_whole=True, reader=None)
-    reader = TrackReader(view, places.map_frame)
+    reader = TrackReader(view, placement.frame_id)
     # From a little earlier on, to know whether the path continues into the window.
     known = reader.track_in(TimeWindow(window.start - SILENCE_NS, window.stop))
-    return RobotPath(places.map_frame, cut_track(known.track, window), known.since is None, reader)
+    return RobotPath(
+        placement.frame_id, cut_track(known.track, window), known.since is None, reader
+    )
 
 
 def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> JsonObject:
