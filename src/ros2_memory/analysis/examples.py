@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.messages.conversions import ANGLES, ValueKind, kind_of_type
@@ -28,15 +29,11 @@ def with_elements(
         definition: of its type.
         paths: where the schema map has each key of the value from; empty if it lacks the type.
     """
-    budget = iter(range(_MOST_FIELDS))
-    if not paths or not isinstance(value, dict):
-        return _filled(value, definition, budget)
-    filled = dict(value)
-    for name in paths.keys() & value.keys():
-        entry = _field_at(definition, paths[name])
-        if entry is not None:
-            filled[name] = _filled_field(value[name], entry, budget)
-    return {name: filled[name] for name in value}
+    if paths:
+        entries = ((name, _field_at(definition, path)) for name, path in paths.items())
+        fields = [entry._replace(name=name) for name, entry in entries if entry is not None]
+        definition = replace(definition, fields=tuple(fields))
+    return _filled(value, definition, iter(range(_MOST_FIELDS)))
 
 
 def _field_at(definition: Definition, path: Sequence[str]) -> Field | None:
@@ -54,21 +51,16 @@ def _filled(value: JsonValue, definition: Definition, budget: Iterator[int]) -> 
     if not isinstance(value, dict):
         return value
     filled = dict(value)
-    for entry in definition.fields:
-        if entry.name in value:
-            filled[entry.name] = _filled_field(value[entry.name], entry, budget)
+    for name, kind, length in definition.fields:
+        part = value.get(name)
+        if not isinstance(kind, Definition):
+            continue
+        if length is None and isinstance(part, dict):
+            filled[name] = _filled(part, kind, budget)
+        elif length is not None and isinstance(part, list):
+            first = _filled(part[0], kind, budget) if part else _example(kind, budget)
+            filled[name] = [first, *part[1:]]
     return filled
-
-
-def _filled_field(value: JsonValue, entry: Field, budget: Iterator[int]) -> JsonValue:
-    if not isinstance(entry.kind, Definition):
-        return value
-    if entry.length is None:
-        return _filled(value, entry.kind, budget)
-    if not isinstance(value, list):
-        return value
-    first = _filled(value[0], entry.kind, budget) if value else _example(entry.kind, budget)
-    return [first, *value[1:]]
 
 
 def _example(kind: str | Definition, budget: Iterator[int]) -> JsonValue:

@@ -12,7 +12,6 @@ the time. It was if its messages follow each other at the detector's usual rate:
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -184,14 +183,6 @@ class IntervalTable(NamedTuple):
         return stable_order(rows["first"] - rows["last"])
 
 
-class IntervalPart(NamedTuple):
-    """Consecutive messages of one topic: first and last log time, and what was visible."""
-
-    first: Ns
-    last: Ns
-    visible: IntervalTable
-
-
 def visible_in(
     times: Ints,
     rows: Ints,
@@ -238,23 +229,15 @@ def _stored_scores(scores: NDArray[np.float64]) -> Ints:
     return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
 
 
-def join_parts(parts: Sequence[IntervalPart]) -> IntervalPart:
-    """Joins consecutive parts of a topic: an object may stay visible from one to the next."""
-    follows = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
-    visible = _merge_tables([part.visible for part in parts], np.array([False, *follows]))
-    return IntervalPart(parts[0].first, parts[-1].last, visible)
+def united_tables(
+    tables: Sequence[IntervalTable], follows: Sequence[bool] | None = None
+) -> IntervalTable:
+    """Returns when objects were visible by any of several tables, as of topics.
 
-
-def united_tables(tables: Sequence[IntervalTable]) -> IntervalTable:
-    """Returns when objects were visible on any of several topics, by a table of each topic."""
-    return _merge_tables(tables, np.zeros(len(tables), np.bool_))
-
-
-def _merge_tables(tables: Sequence[IntervalTable], follows: Flags) -> IntervalTable:
-    """Merges tables: joins intervals of one label that overlap, or that go on in the next table.
-
-    `follows` says for each table whether it follows the one before without a silence.
+    Intervals of one label are joined that overlap. So are those that go on in the next table, if
+    `follows` says of that table that it follows the one before without a silence.
     """
+    is_next = np.array(follows or np.zeros(len(tables)), np.bool_)
     rows = np.frombuffer(b"".join([table.rows for table in tables]), ROW)
     if not rows.size:
         return IntervalTable()
@@ -267,7 +250,7 @@ def _merge_tables(tables: Sequence[IntervalTable], follows: Flags) -> IntervalTa
     rows, part, label = rows[order], part[order], label[order]
     first, ends, reach = rows["first"], rows["ends"], running_end(label, rows["last"])
     goes_on = (ends[:-1] & _TO_END > 0) & (ends[1:] & _FROM_START > 0)
-    goes_on &= (part[1:] - part[:-1] == 1) & follows[part[1:]]
+    goes_on &= (part[1:] - part[:-1] == 1) & is_next[part[1:]]
     goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
     goes_on &= label[1:] == label[:-1]
     rows["label"] = label

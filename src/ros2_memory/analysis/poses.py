@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import Flags, Floats, Vectors, joined_codes, run_starts, stable_order
+from ros2_memory.core.arrays import (
+    Flags,
+    Floats,
+    Vectors,
+    joined_codes,
+    rows_of,
+    run_starts,
+    stable_order,
+    stacked,
+)
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 
@@ -142,20 +151,19 @@ def placed_body(edges: Edges, child: str, frames: FrameTree, window: TimeWindow)
     of_body = [edge for (_, name), edge in edges.items() if name == child]
     if not of_body:
         return NO_POSES
-    times = np.concatenate([edge.log_times for edge in of_body])
-    stamps = np.concatenate([edge.stamps for edge in of_body])
-    order = np.argsort(times, kind="stable")
-    first, end = np.searchsorted(times[order], (window.start, window.stop)).tolist()
-    order = order[first:end]
-    placed = frames.poses(child, (stamps if frames.clock == "stamp" else times)[order])
+    body = stacked(of_body)
+    body = rows_of(body, window.holding(body.log_times))
+    body = rows_of(body, stable_order(body.log_times))
+    times = body.log_times
+    placed = frames.poses(child, body.stamps if frames.clock == "stamp" else times)
     if placed is None:
         return NO_POSES
     poses = Poses(
-        times[order],
+        times,
         np.stack(placed.translation, axis=1),
         np.stack(placed.rotation, axis=1),
-        FrameCodes(np.zeros(order.size, np.uint32), (frames.target,)),
-        np.full(order.size, np.nan),
+        FrameCodes(np.zeros(times.size, np.uint32), (frames.target,)),
+        np.full(times.size, np.nan),
     )
     return poses.rows(np.flatnonzero(placed.valid))
 

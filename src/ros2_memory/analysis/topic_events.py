@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, join_parts, visible_in
+from ros2_memory.analysis.intervals import SILENCE_NS, IntervalTable, united_tables, visible_in
 from ros2_memory.core.arrays import joined_codes, stable_order
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
@@ -98,6 +98,11 @@ class TopicEvents:
     beyond: int = 0
 
     @property
+    def is_empty(self) -> bool:
+        """Whether there is no message, not even an undecodable one."""
+        return self.first > self.last and not self.undecodable
+
+    @property
     def memory_bytes(self) -> int:
         """About how much memory the events take."""
         lists = (self.known, self.changes, self.errors, self.reports, self.visible.labels)
@@ -128,11 +133,14 @@ class TopicEvents:
         )
 
 
-def events_of(stated: Stated) -> TopicEvents | None:
-    """Returns the events of the messages of one topic; None without a message."""
+NO_EVENTS: Final = TopicEvents(1, 0)
+
+
+def events_of(stated: Stated) -> TopicEvents:
+    """Returns the events of the messages of one topic."""
     times, undecodable = stated.times, stated.undecodable.size
     if not times.size:
-        return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
+        return replace(NO_EVENTS, undecodable=undecodable)
     seen = stated.facts.of_kinds({LABEL})
     labels = [word.name for word in seen.words]
     log = _StateLog()
@@ -151,16 +159,15 @@ def events_of(stated: Stated) -> TopicEvents | None:
     )
 
 
-def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
-    """Joins the events of consecutive parts of a history; returns None without a message.
+def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents:
+    """Joins the events of consecutive parts of a history.
 
     At most `MAX_INTERVALS` intervals and `MAX_EVENTS` of other events stay.
     """
     undecodable = sum(part.undecodable for part in parts)
     parts = [part for part in parts if part.first <= part.last]
     if not parts:
-        return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
-    seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
+        return replace(NO_EVENTS, undecodable=undecodable)
     log = _StateLog()
     for part in parts:
         log.add(part.known, part.changes)
@@ -168,7 +175,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
-        join_parts(seen).visible,
+        joined_visible(parts),
         log.states,
         tuple(log.changes),
         _merge_errors(error for part in parts for error in part.errors),
@@ -178,6 +185,12 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
         max(part.beyond for part in parts),
     )
     return whole.limited(MAX_EVENTS, MAX_INTERVALS)
+
+
+def joined_visible(parts: Sequence[TopicEvents]) -> IntervalTable:
+    """Returns when objects were visible in consecutive parts: they may stay so in the next one."""
+    follows = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
+    return united_tables([part.visible for part in parts], [False, *follows])
 
 
 class _StateLog:

@@ -34,7 +34,7 @@ def _joined_stands(parts: Sequence[Stands]) -> Sequence[Stands]:
 
 def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
     whole = joined_events(parts)
-    return [] if whole is None else [whole]
+    return [] if whole.is_empty else [whole]
 
 
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)

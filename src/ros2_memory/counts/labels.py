@@ -17,13 +17,12 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.intervals import (
-    IntervalPart,
     IntervalTable,
     VisibleInterval,
-    join_parts,
     united_tables,
     visible_in,
 )
+from ros2_memory.analysis.topic_events import TopicEvents, joined_visible
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
@@ -83,31 +82,11 @@ class _TopicBlock(NamedTuple):
     detected: Detected
 
 
-class _DetectionFilter(NamedTuple):
-    """Which detections count: those of wanted labels in a scope, from a least score on."""
-
-    is_wanted: Callable[[str], bool]
-    scope: Scope
-    least_score: float
-
-    def counting(self, detected: Detected) -> Flags:
-        """Returns which detections of some messages count."""
-        detections = detected.found
-        labels = detections.labels
-        is_wanted = np.array([self.is_wanted(label) for label in labels.words], np.bool_)
-        counts: Flags = is_wanted[labels.codes] & ~(detections.scores < self.least_score)
-        if self.scope.is_bounded:
-            # A scope reads what the other topics said from the newest message back.
-            holds = [self.scope.holds_at(time) for time in detected.log_times[::-1].tolist()]
-            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
-        return counts
-
-
 class _SeenBlock(NamedTuple):
     """What was in view in a block. See `SeenLabels`; `source` names its topic and window."""
 
     source: str
-    visible: IntervalPart
+    events: TopicEvents
     most_at_once: Counter[str]
     most_of_all: int
 
@@ -240,17 +219,26 @@ def read_labels(
         QueryTimeoutError: the call's time runs out before any result.
     """
     least_score = condition.least_score if condition.min_score > 0 else -math.inf
-    detection_filter = _DetectionFilter(is_wanted, scope, least_score)
-    seen_blocks, since = read_until_late(
-        view, _seen_blocks(view, topics, detection_filter), READING_S
-    )
-    parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
+
+    def counting(detected: Detected) -> Flags:
+        detections, labels = detected.found, detected.found.labels
+        is_counted = np.array([*map(is_wanted, labels.words)], np.bool_)
+        counts: Flags = is_counted[labels.codes] & ~(detections.scores < least_score)
+        if scope.is_bounded:
+            # A scope reads what the other topics said from the newest message back.
+            holds = [*map(scope.holds_at, detected.log_times[::-1].tolist())]
+            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+        return counts
+
+    newest_first = _seen_blocks(view, topics, scope, counting)
+    seen_blocks, since = read_until_late(view, newest_first, READING_S)
+    parts: defaultdict[str, list[TopicEvents]] = defaultdict(list)
     most_at_once = Counter[str]()
     for block in seen_blocks:
-        parts[block.source].append(block.visible)
+        parts[block.source].append(block.events)
         most_at_once |= block.most_at_once
     return SeenLabels(
-        united_tables([join_parts(newest_first[::-1]).visible for newest_first in parts.values()]),
+        united_tables([joined_visible(newest[::-1]) for newest in parts.values()]),
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,
@@ -258,20 +246,19 @@ def read_labels(
 
 
 def _seen_blocks(
-    view: View, topics: Sequence[str], detection_filter: _DetectionFilter
+    view: View, topics: Sequence[str], scope: Scope, counting: Callable[[Detected], Flags]
 ) -> Iterator[tuple[Ns, _SeenBlock]]:
     """Yields what was in view in each block, newest first, and a log time.
 
-    Nothing that is later than this time follows.
+    Nothing that is later than this time follows. `counting` says which detections count.
     """
-    for nth, window in enumerate(detection_filter.scope.narrowed()):
+    for nth, window in enumerate(scope.narrowed()):
         by_topic = (_topic_blocks(view, topic, window) for topic in topics)
         newest_first = heapq.merge(*by_topic, key=lambda block: -block.detected.log_times[-1])
         for topic, detected in newest_first:
-            counts = detection_filter.counting(detected)
             # Blocks of different topics may overlap.
             reached = detected.log_times[0 if len(topics) == 1 else -1]
-            yield int(reached), _seen_in_block(f"{nth} {topic}", detected, counts)
+            yield int(reached), _seen_in_block(f"{nth} {topic}", detected, counting(detected))
 
 
 def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_TopicBlock]:
@@ -301,7 +288,7 @@ def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock
     visible = visible_in(times, rows, codes, detections.scores[counts], labels)
     return _SeenBlock(
         source,
-        IntervalPart(int(times[0]), int(times[-1]), visible),
+        TopicEvents(int(times[0]), int(times[-1]), visible),
         most_at_once,
         int(np.bincount(rows).max(initial=0)),
     )

@@ -24,14 +24,8 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_errors, has_events
-from ros2_memory.analysis.intervals import (
-    FLICKER_NS,
-    SILENCE_NS,
-    IntervalPart,
-    IntervalTable,
-    join_parts,
-)
-from ros2_memory.analysis.topic_events import TopicEvents, joined_events
+from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, IntervalTable
+from ros2_memory.analysis.topic_events import TopicEvents, joined_events, joined_visible
 from ros2_memory.core.arrays import bounds_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -290,8 +284,8 @@ def _visible_by_events(
     for part in events:
         others = [label for label in part.visible.labels if not matches(label)]
         if part.first <= part.last:
-            parts.append(IntervalPart(part.first, part.last, part.visible.without(others)))
-    return join_parts(parts).visible if parts else IntervalTable()
+            parts.append(replace(part, visible=part.visible.without(others)))
+    return joined_visible(parts)
 
 
 def _flag_spans(
@@ -311,7 +305,7 @@ def _flag_spans(
     states = _flag_states(binned, topic, events, condition, before, wanted=wanted)
     if states is None:
         return None
-    last = binned.window.start if events is None else events.last
+    last = binned.window.start if events.is_empty else events.last
     end = held_until(binned.view, topic, last, max(last, binned.window.stop), or_rare=True)
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
     gaps = _gaps_for_topic(binned, topic)
@@ -329,7 +323,7 @@ def _flag_spans(
 def _flag_states(
     binned: BinnedWindow,
     topic: str,
-    events: TopicEvents | None,
+    events: TopicEvents,
     condition: Condition,
     before: bool | None,
     *,
@@ -341,7 +335,7 @@ def _flag_states(
     """
     start, _ = binned.counted.asked()
     states = [] if before is None else [(start, before)]
-    if events is None:
+    if events.is_empty:
         return states
     flags, toggles = events.of_kind(FLAG)
     meant = [flag for flag in flags if condition.field in {None, flag.name}]

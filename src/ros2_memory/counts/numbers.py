@@ -243,7 +243,7 @@ class PieceNumbers:
         """Yields the numbers in a table's messages from log time `since` on."""
         piece = bisect_right(self._edges, rows.first)
         is_in_piece = rows.first >= since and piece == bisect_right(self._edges, rows.last)
-        if rows.index is None and is_in_piece:
+        if is_in_piece:
             outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
             parts = [part for part in outlines if part is not None]
             if len(parts) == len(outlines):
@@ -257,9 +257,12 @@ class PieceNumbers:
             yield from self._parts_in_pieces(stored_rows, numbers_of_fields, since)
 
     def _outlined(self, rows: Rows, field: int) -> Part | None:
-        """Returns the numbers of a field as the table's outline has them; None without one."""
+        """Returns the numbers of a field as the table's outline has them.
+
+        None without an outline, or if only some of its rows count.
+        """
         table = rows.table
-        if not isinstance(table, StoredTable) or table.definition is None:
+        if rows.index is not None or not isinstance(table, StoredTable) or not table.definition:
             return None
         key = (table.definition, table.channel.type, self._fields[field])
         if key not in self._columns:
@@ -297,10 +300,7 @@ class PieceNumbers:
         self, rows: Rows, numbers_of_fields: Sequence[FieldNumbers], since: Ns
     ) -> Iterator[_KeyedPart]:
         """Yields the numbers of each field in the rows from log time `since` on."""
-        outlines = [
-            self._outlined(rows, field) if rows.index is None else None
-            for field in range(len(numbers_of_fields))
-        ]
+        outlines = [self._outlined(rows, field) for field in range(len(numbers_of_fields))]
         for piece, start, stop in self._pieces(rows, since):
             is_whole = stop - start == len(rows)
             first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()

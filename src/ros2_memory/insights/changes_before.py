@@ -31,7 +31,7 @@ from ros2_memory.analysis.facts import (
     has_events,
 )
 from ros2_memory.analysis.goals import GOAL_WORDS
-from ros2_memory.analysis.topic_events import Change, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import NO_EVENTS, Change, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, shortened
@@ -162,9 +162,7 @@ def topics_with_changes(view: View) -> list[str]:
     ]
 
 
-def changes_in(
-    view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents | None]
-) -> ChangesBefore:
+def changes_in(view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents]) -> ChangesBefore:
     """Returns what changed in a window, and in the seconds before it.
 
     Args:
@@ -180,10 +178,10 @@ def changes_in(
         types = timeline.types_of(topic)
         inside = earlier[topic] if topic in earlier else events_in(view, topic, window)
         events = _with_state_before(view, topic, window, inside, types)
-        if events is not None:
+        if not events.is_empty:
             events_of_topics[topic] = events
-        can_show_changes = any(map(has_changes, types)) or (events is not None and events.known)
-        if can_show_changes and _is_recorded(view, topic, window):
+        can_show_changes = any(map(has_changes, types)) or events.known
+        if can_show_changes and any(timeline.extents(topic, window.widened(_AROUND_NS))):
             looked_at.append(topic)
     changes: list[_DatedChange] = []
     for topic, events in events_of_topics.items():
@@ -207,16 +205,13 @@ def _commanded_stops(
     """Yields when the commanded velocity became zero while a goal was active."""
     activities = {topic: [*_goal_activity(events)] for topic, events in events_of_topics.items()}
     _, commands = events_of_topics[command].of_kind(COMMAND)
-    for change in commands:
-        if change.value:
-            continue
+    for at in (change.time for change in commands if not change.value):
         is_active = any(
-            _is_active(activity, change.time) and _has_message_of_run(view, topic, change.time)
+            _is_active(activity, at) and _has_message_of_run(view, topic, at)
             for topic, activity in activities.items()
         )
         if is_active:
-            text = f"{command} went to zero while a goal was active"
-            yield _DatedChange(change.time, change.time, text)
+            yield _DatedChange(at, at, f"{command} went to zero while a goal was active")
 
 
 def _firsts_of_runs(view: View, topic: str, window: TimeWindow) -> frozenset[Ns]:
@@ -244,11 +239,6 @@ def _has_message_of_run(view: View, topic: str, at: Ns) -> bool:
     return any(view.timeline.extents(topic, TimeWindow(begun, at + 1)))
 
 
-def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
-    """Returns whether a topic was recorded around a window."""
-    return any(view.timeline.extents(topic, window.widened(_AROUND_NS)))
-
-
 def _command_topic(view: View) -> str:
     """Returns the topic of velocities that command the robot's base; empty if there is none.
 
@@ -269,23 +259,23 @@ def _with_state_before(
     view: View,
     topic: str,
     window: TimeWindow,
-    events: TopicEvents | None,
+    events: TopicEvents,
     types: Sequence[str],
-) -> TopicEvents | None:
+) -> TopicEvents:
     """Returns the events in a window, joined with the state before it.
 
-    None if the topic cannot have changes, as a detector's: then nothing before is read.
+    No events, if the topic cannot have changes, as a detector's: then nothing before is read.
     """
-    if not (LOG in types or events is None or events.known):
-        return None
+    if not (LOG in types or events.is_empty or events.known):
+        return NO_EVENTS
     start = max(window.start - _LEAD_NS, MIN_NS)
     if _holds_over_runs(view, topic):
         newest = held_at(view, topic, start)
     else:
         newest = view.stream.newest(topic, TimeWindow(max(start - _OLDEST_STATE_NS, MIN_NS), start))
-    before = None if newest is None else events_of_messages(view, [newest])
+    before = events_of_messages(view, [] if newest is None else [newest])
     parts = (before, events_in(view, topic, TimeWindow(start, window.start)), events)
-    return joined_events([part.without_sights() for part in parts if part is not None])
+    return joined_events([part.without_sights() for part in parts])
 
 
 def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
@@ -294,32 +284,23 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
         span_s, often = unix_from_ns(report.last - report.first), report.reports
         again = f" ({often} times in {span_s:.0f} s)" if often > 1 else ""
         yield _DatedChange(report.first, report.last, Quoted(report.text + again))
-    yield from _toggles_of_topic(topic, events)
+    for together in toggled_together(change for change in events.changes if change.kind == FLAG):
+        at = together[0].time
+        yield _DatedChange(at, at, toggle_sentence(topic, *together), topic)
     level = next((state.first for state in events.known if state.kind == CHARGE), 0)
     for change in events.changes:
-        if change.kind == GOAL and change.value not in GOAL_WORDS:
-            text = ""  # it was accepted before
-        else:
-            text = _change_sentence(topic, change, level)
+        is_accepted_before = change.kind == GOAL and change.value not in GOAL_WORDS
+        text = "" if is_accepted_before else _change_sentence(topic, change, level)
         if change.kind == CHARGE:
             level = change.value
         if text:
             yield _DatedChange(change.time, change.time, text)
-    for state in events.known:
+    for kind, name, at, first, _, said in events.known:
         # Earlier messages did not have this goal, this status that is not ok, or this low charge.
-        is_new = state.at != events.first
-        if is_new and (state.kind == GOAL or state.first):
-            change = Change(state.kind, state.name, state.at, state.first, state.text)
-            text = _change_sentence(topic, change, 0)
+        if at != events.first and (kind == GOAL or first):
+            text = _change_sentence(topic, Change(kind, name, at, first, said), 0)
             if text:
-                yield _DatedChange(state.at, state.at, text)
-
-
-def _toggles_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
-    """Yields when booleans of a topic toggled; those of one message to the same value at once."""
-    for together in toggled_together(change for change in events.changes if change.kind == FLAG):
-        at = together[0].time
-        yield _DatedChange(at, at, toggle_sentence(topic, *together), topic)
+                yield _DatedChange(at, at, text)
 
 
 def _change_sentence(topic: str, change: Change, level_before: int) -> str:

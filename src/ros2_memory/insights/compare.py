@@ -76,7 +76,7 @@ from ros2_memory.things.unseen import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
@@ -137,6 +137,7 @@ def compare(
     windows = clamped(views[0], asked), clamped(views[1], other)
     call.asked = windows
     this, that = sides = _side_of(views[0], windows[0]), _side_of(views[1], windows[1])
+    errors, silences = _in_both(sides, _error_counts), _in_both(sides, _silent_seconds)
     frame, things = _compare_things(sides, region)
     minutes = _minutes_in_places(sides, region)
     way_frame, stood = _compare_standstills(sides, region)
@@ -150,8 +151,6 @@ def compare(
         side.view.notes.retract_outside(*windows)
     if region is not None:
         notes.add("way, errors and silent_s are not only of that place")
-    errors = _in_both(sides, this.errors, that.errors)
-    silences = _in_both(sides, this.silences, that.silences)
     return Comparison(
         oldest=min(window.start for window in windows),
         newest=max(window.stop for window in windows),
@@ -159,7 +158,7 @@ def compare(
         recorded=Pair(this.recorded_s, that.recorded_s),
         frame_id=frame,
         things=things,
-        way=_differing(this.way, that.way, least=_LEAST),
+        way=_differing(*(_path_numbers(side.drive) for side in sides), least=_LEAST),
         places=_differing(*minutes, least=_LEAST_MINUTES),
         errors=_differing(*errors, least=_LEAST_COUNT),
         silences=_differing(*silences, least=_LEAST_SILENT_S),
@@ -197,9 +196,6 @@ class _Side(NamedTuple):
         view: shows the days of the window.
         is_recorded: whether anything was recorded in it.
         placement: the frames of the robot's poses and of places; None without poses.
-        way: the numbers of the path by the names in `_LEAST`; None for an unknown number.
-        errors: how often each error was reported.
-        silences: for how many seconds each topic was silent while the robot was on.
         length_s: how long the window is.
         recorded_s: how much of it was recorded.
     """
@@ -209,9 +205,6 @@ class _Side(NamedTuple):
     is_recorded: bool
     drive: Drive
     placement: MapPlacement | None
-    way: Mapping[str, float | None]
-    errors: _Numbers
-    silences: _Numbers
     length_s: float
     recorded_s: float
 
@@ -238,9 +231,6 @@ def _side_of(view: View, window: TimeWindow) -> _Side:
         is_recorded,
         drive,
         known_placement(view),
-        _path_numbers(drive),
-        _error_counts(view, window),
-        _silent_seconds(view, window),
         unix_from_ns(drive.elapsed.between(*window.asked())),
         _recorded_seconds(view, window, drive.elapsed),
     )
@@ -612,7 +602,7 @@ def _error_counts(view: View, window: TimeWindow) -> _Numbers:
     """Returns how often each error was reported, by its text and its topic."""
     counts: _Numbers = defaultdict(float)
     for topic, events in events_by_topic(view, window, has_errors).items():
-        for error in () if events is None else events.errors:
+        for error in events.errors:
             counts[Quoted(error.text), topic] += error.reports
     return counts
 
@@ -625,8 +615,11 @@ def _silent_seconds(view: View, window: TimeWindow) -> _Numbers:
     return seconds
 
 
-def _in_both(sides: tuple[_Side, _Side], *numbers: _Numbers) -> list[dict[str, float | None]]:
-    """Returns for each window its numbers by name, those of the other one's names as well."""
+def _in_both(
+    sides: tuple[_Side, _Side], count: Callable[[View, TimeWindow], _Numbers]
+) -> list[dict[str, float | None]]:
+    """Returns what is counted in each window by name, with the names of the other one as well."""
+    numbers = [count(side.view, side.window) for side in sides]
     topics: dict[str, set[str]] = defaultdict(set)
     for name, topic in chain(*numbers):
         topics[name].add(topic)

@@ -314,8 +314,8 @@ def _place_names(event: Event, places: RobotPlaces | None) -> tuple[str, ...]:
 
 def events_by_topic(
     view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
-) -> dict[str, TopicEvents | None]:
-    """Returns the events of each topic that can have them, by its types; None for no message."""
+) -> dict[str, TopicEvents]:
+    """Returns the events of each topic that can have them, by its types."""
     timeline = view.timeline
     return {
         topic: events_in(view, topic, window)
@@ -327,14 +327,12 @@ def events_by_topic(
 def _reported_events(
     view: View,
     window: TimeWindow,
-    events_of_topics: Mapping[str, TopicEvents | None],
+    events_of_topics: Mapping[str, TopicEvents],
     region_stays: _RegionStays | None,
 ) -> list[Event]:
     """Returns the toggles and errors that messages report. Notes say how many are left out."""
     events: list[Event] = []
     for topic, topic_events in events_of_topics.items():
-        if topic_events is None:
-            continue
         toggles = _toggles(view, topic, topic_events)
         if toggles:
             events += _flip_events(topic, toggles, _ends_of_holding(view, topic, window))
@@ -384,7 +382,7 @@ class _ThingsInView(NamedTuple):
 def _things_in_view(
     view: View,
     window: TimeWindow,
-    events_of_topics: Mapping[str, TopicEvents | None],
+    events_of_topics: Mapping[str, TopicEvents],
     region_stays: _RegionStays | None,
     *,
     min_score: float,
@@ -401,7 +399,7 @@ def _things_in_view(
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
-    for topic_events in filter(None, events_of_topics.values()):
+    for topic_events in events_of_topics.values():
         visible = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
         below += topic_events.visible.size - visible.size
         tables.append(visible)
@@ -487,8 +485,7 @@ def _errors_in_region(
     ):
         return events.errors
     parts = [events_in(view, topic, TimeWindow(*time)) for time in region_stays.times]
-    inside = joined_events([part for part in parts if part is not None])
-    return () if inside is None else inside.errors
+    return joined_events(parts).errors
 
 
 def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
@@ -576,34 +573,23 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
             past[event] = changes.before(event.start, without=own, beside=topic)
         elif event.kind in {"stop", "drop"}:
             past[event] = changes.before(event.start, slack=SLACK_NS)
-    counts_shown = _counts_shown(past)
-    return [
-        replace(event, before=past[event][: counts_shown[event]]) if event in past else event
-        for event in events
-    ]
+    # The nearest changes of all events come first, then the second nearest, and so on. An event
+    # whose nearer change has no room shows no farther one.
+    shown: defaultdict[Event, list[PastChange]] = defaultdict(list)
+    chars_left = _MOST_CHARS
+    for nth in range(_MOST_CHANGES):
+        for event, of_event in past.items():
+            has_next = len(of_event) > nth == len(shown[event])
+            size = len(of_event[nth].text) + _CHANGE_CHARS if has_next else 0
+            if has_next and size <= chars_left:
+                chars_left -= size
+                shown[event].append(of_event[nth])
+    return [replace(event, before=tuple(shown[event])) for event in events]
 
 
 def _boolean_of(event: Event) -> str:
     """Returns the sentence on a toggled boolean without its value; empty for another event."""
     return event.text.rpartition(" ")[0] if event.kind == "flip" else ""
-
-
-def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> dict[Event, int]:
-    """Returns how many of the nearest changes before each event there is room for.
-
-    The nearest changes of all events come first, then the second nearest, and so on.
-    """
-    counts_shown = dict.fromkeys(changes_of_events, 0)
-    chars_left = _MOST_CHARS
-    for nth in range(_MOST_CHANGES):
-        for event, past in changes_of_events.items():
-            # An event whose nearer change had no room shows no farther one.
-            has_next = len(past) > nth == counts_shown[event]
-            size = len(past[nth].text) + _CHANGE_CHARS if has_next else 0
-            if has_next and size <= chars_left:
-                chars_left -= size
-                counts_shown[event] += 1
-    return counts_shown
 
 
 def _most_important(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -64,7 +64,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
 
-Row = TypeVar("Row", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
@@ -112,9 +111,7 @@ def find_matches(
     found = _select_rows(view, topic, condition, scope, selection)
     topics, is_never = matching_topics(view, topic), found.total == 0
     elapsed = elapsed_in(view, found.searched)
-    sightings = tuple(_with_durations(sighting, elapsed, other) for sighting in found.sightings)
-    episodes = tuple(_with_durations(episode, elapsed, other) for episode in found.episodes)
-    rows: list[Sighting | Episode] = [*sightings, *episodes]
+    rows = [_with_durations(row, elapsed, other) for row in found.rows]
     note_robots_on(view, topics, found.searched)
     note_unread(view, found.searched, nothing=is_never, search=True)
     if is_never:
@@ -127,7 +124,7 @@ def find_matches(
         notes += notes_on_never(view, sought, condition, window, is_bounded=bounded)
     total = found.total if scope.since is None else None
     return Sightings(
-        sightings,
+        tuple(row for row in rows if isinstance(row, Sighting)),
         more=total is None or total > len(rows),
         total=total,
         start=start,
@@ -136,7 +133,7 @@ def find_matches(
         unknown=elapsed.among(scope.unknown),
         topic="" if topics[1:] else topics[0],
         of_texts=found.of_texts,
-        episodes=episodes,
+        episodes=tuple(row for row in rows if isinstance(row, Episode)),
         notes=notes,
     )
 
@@ -165,13 +162,12 @@ class _SelectedRows(NamedTuple):
     Attributes:
         total: how many there are; None if the search ended before it counted all.
         searched: the part of the window in which all matches are known.
-        of_texts: whether there are `episodes` in place of sightings.
+        of_texts: whether rows are episodes.
     """
 
     total: int | None
     searched: TimeWindow
-    sightings: Sequence[Sighting] = ()
-    episodes: Sequence[Episode] = ()
+    rows: Sequence[Sighting | Episode]
     of_texts: bool = False
 
 
@@ -194,12 +190,14 @@ def _select_rows(
     search = ReverseSearch(view, pattern, condition)
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_latched_notes(view, search, scope.window))
-    if selected.sightings:
+    if selected.rows:
         view.notes.add(*_notes_on_texts(view, topics))
     return selected
 
 
-def _with_durations(row: Row, elapsed: Elapsed, other: MeanwhileReader | None) -> Row:
+def _with_durations(
+    row: Sighting | Episode, elapsed: Elapsed, other: MeanwhileReader | None
+) -> Sighting | Episode:
     """Returns a row with how much of its time does not count, and what was said meanwhile."""
     skipped = elapsed.skipped_between(row.first, row.until)
     if isinstance(row, Episode):
@@ -245,7 +243,7 @@ def _select_episodes(
         for episode in found.episodes
         if view.call.wants(episode.until)
     ]
-    return _SelectedRows(found.total, searched, episodes=episodes, of_texts=True)
+    return _SelectedRows(found.total, searched, episodes, of_texts=True)
 
 
 def _find_runs_early(

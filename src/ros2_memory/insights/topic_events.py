@@ -98,8 +98,7 @@ def flags_before(view: View, topic: str, first: Ns) -> dict[str, bool]:
     Empty if a message may be missing in between: the booleans may have toggled there.
     """
     message = message_before(view, topic, first)
-    messages = [] if message is None else [message]
-    flags, _ = (events_of_messages(view, messages) or TopicEvents(1, 0)).of_kind(FLAG)
+    flags, _ = events_of_messages(view, [] if message is None else [message]).of_kind(FLAG)
     return {flag.name: bool(flag.last) for flag in flags}
 
 
@@ -110,8 +109,8 @@ def _is_unbroken(view: View, topic: str, before: Ns, first: Ns) -> bool:
     return not is_broken and not unrecorded_times(view, topic, between)
 
 
-def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
-    """Returns what the messages of a topic report in a window; None without messages.
+def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents:
+    """Returns what the messages of a topic report in a window.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -155,8 +154,8 @@ def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterat
     yield from merge(*((at for at, _ in timed) for timed in of_topics), reverse=True)
 
 
-def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
-    """Returns what messages of one topic report; None without messages."""
+def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents:
+    """Returns what messages of one topic report."""
     return events_of(_stated_in_messages(view, messages))
 
 
@@ -181,12 +180,7 @@ def events_by_bag(
             else:
                 of_bag = _stated_in_rows(view, columns, rows.some(positions))
                 stated_of_bags[bag.file].append(of_bag)
-    events_of_bags = {}
-    for file, parts in stated_of_bags.items():
-        events = events_of(joined_stated(parts))
-        if events is not None:
-            events_of_bags[file] = events
-    return events_of_bags
+    return {file: events_of(joined_stated(parts)) for file, parts in stated_of_bags.items()}
 
 
 def _events_of_rows(
@@ -196,7 +190,7 @@ def _events_of_rows(
 
     def make() -> TopicEvents:
         stated = joined_stated([_stated_in_rows(view, columns, rows) for rows in overlapping])
-        return events_of(stated) or TopicEvents(1, 0)
+        return events_of(stated)
 
     parts = tuple(rows.part for rows in overlapping if rows.part is not None)
     key = None
@@ -328,14 +322,14 @@ def action_of(topic: str) -> str:
 
 
 def goals_in(
-    view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents | None]
+    view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents]
 ) -> Iterator[GoalRun]:
     """Yields the goals that were active in a window, and that a message in it lists.
 
     `events_of_topics` has what the messages of each topic report in the window.
     """
     for topic, events in events_of_topics.items():
-        if events is None or GOALS not in view.timeline.types_of(topic):
+        if not events.known or GOALS not in view.timeline.types_of(topic):
             continue
         goals = [*_goal_runs(topic, events, *_listed_before(view, topic, window, events))]
         active = {goal.goal for goal in goals if goal.ended is None}
@@ -353,9 +347,9 @@ def _listed_before(
     And whether they are all the goals until the first message of the window.
     """
     message = view.stream.last(topic, window.start)
-    earlier = None if message is None else events_of_messages(view, [message])
-    if message is None or earlier is None:
+    if message is None:
         return {}, False
+    earlier = events_of_messages(view, [message])
     goals, _ = earlier.of_kind(GOAL)
     is_whole = not (earlier.beyond or earlier.undecodable)
     is_all = is_whole and _is_unbroken(view, topic, message.time, events.first)
@@ -375,7 +369,7 @@ def last_listings(view: View, topic: str, window: TimeWindow, active: set[str]) 
     messages = view.stream.messages([topic], window, newest_first=True)
     for nth, message in enumerate(messages):
         events = events_of_messages(view, [message])
-        if events is None or events.beyond or events.undecodable:
+        if events.beyond or events.undecodable:
             break  # the message may list goals that are not known
         goals, _ = events.of_kind(GOAL)
         listed = missing.intersection(goal.name for goal in goals)
@@ -420,15 +414,14 @@ def _known_goals(view: View, topics: Sequence[str], window: TimeWindow) -> Itera
     """Yields the goals that were active in a window, even if no message in it lists them."""
     events_of_topics = {topic: events_in(view, topic, window) for topic in topics}
     for topic, events in events_of_topics.items():
-        if events is not None:
-            note_limits(view, topic, events)
+        note_limits(view, topic, events)
     start, _ = window.asked()
     active_at_start = {topic: _active_at(view, topic, start) for topic in topics}
     for goal in goals_in(view, window, events_of_topics):
         was_active = goal.accepted is None and goal.goal in active_at_start[goal.topic]
         yield goal._replace(first=start) if was_active else goal
     for topic, events in events_of_topics.items():
-        if events is None:
+        if events.is_empty:
             for name, status in active_at_start[topic].items():
                 yield GoalRun(topic, name, None, None, status, start, start)
 
@@ -441,8 +434,7 @@ def _active_at(view: View, topic: str, moment: Ns) -> dict[str, int]:
     held = held_at(view, topic, moment)
     if held is None or any(held.time <= start < moment for start, _ in view.snapshot.breaks):
         return {}
-    events = events_of_messages(view, [held])
-    listed = [] if events is None else events.of_kind(GOAL)[0]
+    listed, _ = events_of_messages(view, [held]).of_kind(GOAL)
     return {goal.name: goal.last for goal in listed if goal.last not in ENDED}
 
 

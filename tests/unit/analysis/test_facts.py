@@ -40,7 +40,6 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     for nth in range(15):
         at = nth * 100 * NS_PER_S
         glimpse = events_of(stated_by([at], [State(((Word(LABEL, f"cup {nth}"), math.nan),))]))
-        assert glimpse is not None
         parts.append(
             replace(
                 glimpse,
@@ -51,7 +50,6 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
             )
         )
     events = joined_events(parts)
-    assert events is not None
     assert events.visible.size == len(events.changes) == len(events.errors) == 10
     assert events.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14

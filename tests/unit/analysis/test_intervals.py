@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import (
     FLICKER_NS,
     SILENCE_NS,
-    IntervalPart,
+    IntervalTable,
     VisibleInterval,
     united_tables,
     visible_in,
@@ -40,7 +40,7 @@ def histories(draw: st.DrawFn) -> Messages:
     return messages
 
 
-def watched(messages: Messages) -> IntervalPart:
+def watched(messages: Messages) -> IntervalTable:
     labels = sorted({label for _, labels in messages for label in labels})
     seen = [
         (nth, labels.index(label), score)
@@ -50,9 +50,7 @@ def watched(messages: Messages) -> IntervalPart:
     rows, codes = np.array([each[:2] for each in seen], np.int64).reshape(-1, 2).T
     scores = np.array([score for *_, score in seen], np.float64)
     times = np.array([time for time, _ in messages], np.int64)
-    return IntervalPart(
-        messages[0][0], messages[-1][0], visible_in(times, rows, codes, scores, labels)
-    )
+    return visible_in(times, rows, codes, scores, labels)
 
 
 def by_hand(messages: Messages) -> list[VisibleInterval]:
@@ -78,7 +76,7 @@ def by_hand(messages: Messages) -> list[VisibleInterval]:
 
 @given(histories())
 def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: Messages) -> None:
-    seen, expected = watched(messages).visible, by_hand(messages)
+    seen, expected = watched(messages), by_hand(messages)
     rounded = [
         each._replace(best=None if each.best is None else round(each.best, 4)) for each in expected
     ]
@@ -92,7 +90,7 @@ def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: 
 def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
     topics: list[Messages],
 ) -> None:
-    each = [watched(messages).visible for messages in topics]
+    each = [watched(messages) for messages in topics]
     together = united_tables(each)
     spans = [one for seen in each for one in seen.intervals()]
     for interval in together.intervals():

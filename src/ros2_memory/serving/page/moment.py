@@ -116,7 +116,7 @@ def sightings_shown(
     spellings = [
         (topic, spelling)
         for topic, events in events_by_topic(view, window).items()
-        if events is not None and events.visible.size
+        if events.visible.size
         for spelling in sorted({label, *events.visible.labels})
         if key_of(spelling) == key_of(label)
     ]

@@ -58,9 +58,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     """
     view = View(memory, call.within(_PATIENT_S), window.stop)
     least = memory.limits.min_score
-    in_view = [
-        events.visible for events in events_by_topic(view, window).values() if events is not None
-    ]
+    in_view = [events.visible for events in events_by_topic(view, window).values()]
     if least:
         in_view = [visible.scoring(least) for visible in in_view]
     rows = [
