@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from statistics import median_low
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
@@ -362,13 +363,11 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         fastest_mps: a step that would take a higher speed is a jump.
     """
     motion, steps_m = Motion(fastest_mps), np.zeros(len(times) - 1)
-    parted: list[int] = []
-    begins: list[int] = []
+    parted, begins = list[int](), [0]
     apart = np.diff(times)
     plain_m = np.sqrt(row_sums(np.diff(positions, axis=0) ** 2))
-    begin = 0
     for index in _odd_steps(apart, plain_m, fastest_mps):
-        earlier = _poses(times, positions, max(begin, index - _NEARBY), index + 1)
+        earlier = _poses(times, positions, max(begins[-1], index - _NEARBY), index + 1)
         later = _poses(times, positions, index + 1, index + 2 + _NEARBY)
         # Too few poses do not show what is usual.
         are_enough = len(earlier) + len(later) >= _NEARBY
@@ -377,18 +376,15 @@ def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> Measur
         kind = link(here, there, _usual_ns(apart, index), fastest_mps, near)
         if kind == "driven":
             continue
-        measured_leg = _measured_leg(times[begin : index + 1], positions[begin : index + 1])
-        steps_m[begin:index] = measured_leg.steps_m
-        motion.add(measured_leg)
         motion.count_break(kind, here, there)
-        begin = index + 1
-        begins.append(begin)
+        begins.append(index + 1)
         if kind != "gap":
-            parted.append(begin)
-    measured_leg = _measured_leg(times[begin:], positions[begin:])
-    steps_m[begin:] = measured_leg.steps_m
-    motion.add(measured_leg)
-    return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), tuple(begins), steps_m)
+            parted.append(index + 1)
+    for begin, stop in pairwise([*begins, len(times)]):
+        measured_leg = _measured_leg(times[begin:stop], positions[begin:stop])
+        steps_m[begin : stop - 1] = measured_leg.steps_m
+        motion.add(measured_leg)
+    return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), tuple(begins[1:]), steps_m)
 
 
 class _MeasuredLeg(NamedTuple):

@@ -204,7 +204,7 @@ def measure(seconds: Floats, positions: Vectors) -> Measured:
     # Creeps replace the steps in them. Those at the ends are counted once the path is joined.
     moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
     first_creep = last_creep = None
-    for begin, end in _runs(stationary):
+    for begin, end in runs_of(stationary):
         if end - begin < min(_STATIONARY_STEPS, len(plain)):
             continue
         run = slice(begin, end + 1)
@@ -263,7 +263,7 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> _StepLengths:
     lengths[as_plain] = plain[as_plain]
     # A wide slope before a sudden start reaches into the steps after it, which count by themselves.
     # So no run may be longer than its plain length.
-    for begin, end in _runs(~as_plain):
+    for begin, end in runs_of(~as_plain):
         most, summed = plain[begin:end].sum(), lengths[begin:end].sum()
         if summed > most:
             lengths[begin:end] *= most / summed
@@ -311,7 +311,7 @@ def _extended(rows: Vectors, before: int, count: int) -> Vectors:
     return extended
 
 
-def _runs(marks: Flags) -> list[list[int]]:
+def runs_of(marks: Flags) -> list[list[int]]:
     """Returns the half-open ranges in which all marks are set."""
     edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
     return edges.reshape(-1, 2).tolist()

@@ -107,7 +107,6 @@ _OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
 PER_METRE: Final = 10_000
 """Means of positions are rounded, so that the order of their sums does not matter."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
-
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
 """How far drift alone spreads the means of a block."""
 
