@@ -172,12 +172,12 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
         limits = replace(limits, places=(), places_file="")
     memory = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
     if lake is None:
-        return Robot(name, own.recording.bag_dir, memory)
+        return Robot(name, memory)
     shipped = _shipped(memory, lake, own, name, shared)
     if name not in settings.fleet.robots:
-        return Robot(name, Path(name), shipped, in_lake=True)
-    both = replace(shipped, index=JoinedIndex(shipped.index, memory.index))
-    return Robot(name, own.recording.bag_dir, both, memory, in_lake=True)
+        return Robot(name, shipped, in_lake=True)
+    both = replace(shipped, index=JoinedIndex(shipped.index, memory.index, own.recording.bag_dir))
+    return Robot(name, both, memory, in_lake=True)
 
 
 def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: SharedParts) -> Memory:

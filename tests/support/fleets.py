@@ -138,7 +138,7 @@ def fleet_over(
     limits: QuerySettings | None = None,
 ) -> Fleet:
     """The fleet of `folder/<name>`, asked at `NOW`."""
-    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in names]
+    robots = [Robot(name, fleet_memory(folder / name, limits)) for name in names]
     return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
 
 

@@ -173,5 +173,5 @@ def store_columns(memory: Memory) -> Filling:
 
 def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False, now: int = NOW) -> Fleet:
     """The fleet of some memories."""
-    robots = [Robot(name, Path("/") / name, memory) for name, memory in memories.items()]
+    robots = [Robot(name, memory) for name, memory in memories.items()]
     return Fleet(robots, FixedClock(now), shared_map=shared_map)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
@@ -41,11 +41,7 @@ class JoinedIndex:
 
     shipped: SnapshotSource
     own: SnapshotSource
-    bag_dir: Path = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Takes the path from the index of the bag directory."""
-        self.bag_dir = self.own.bag_dir
+    bag_dir: Path
 
     @property
     def published(self) -> Snapshot | None:

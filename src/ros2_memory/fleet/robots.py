@@ -28,7 +28,6 @@ from ros2_memory.history.context import Call, Memory, Stages
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-    from pathlib import Path
 
     from ros2_memory.lake.engine import Lake
 
@@ -84,14 +83,12 @@ class Robot:
 
     Attributes:
         name: its name in replies and arguments; never a path.
-        bag_dir: the bag directory, which need not exist.
         memory: the memory over its bags and, if there is a lake, the bags that were shipped.
         own: the memory over its bags alone; None if it has no bag directory, or there is no lake.
         in_lake: whether `memory` is over a lake, too.
     """
 
     name: str
-    bag_dir: Path
     memory: Memory
     own: Memory | None = None
     in_lake: bool = False

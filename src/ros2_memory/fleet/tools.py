@@ -161,7 +161,7 @@ class _FleetQuestion:
             answer, lake = self._ask_memory(robot, partial(_answer, self.question), own)
             report = self._lake_report(answer, lake)
             notes = () if report is None else (*shipped_to({robot.name: report}), *report.notes)
-            return OfRobot(robot.name, robot.bag_dir, answer, notes, own.now)
+            return OfRobot(robot.name, robot.memory.index.bag_dir, answer, notes, own.now)
 
         answer_or_error = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(answer_or_error, EpisodicError):

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from importlib.resources import files
+from itertools import count
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -66,8 +67,6 @@ _PROPERTIES: Final = {
 }
 _PARTITIONED_BY: Final = ("robot", "day")
 _ROW_GROUP: Final = 1 << 17
-_MAP_IDS: Final = 100
-"""The first field id for keys and values of maps; there are fewer columns."""
 
 
 @dataclass(frozen=True)
@@ -91,19 +90,19 @@ class LakeTable:
     @cached_property
     def schema(self) -> IcebergSchema:
         """Its columns for Iceberg, each with its meaning."""
-        fields = []
-        for number, (name, (kind, meaning)) in enumerate(self.columns.items(), 1):
+        fields, ids = [], count(1)
+        for name, (kind, meaning) in self.columns.items():
             iceberg_type: object = kind
             if kind.startswith("map "):
                 iceberg_type = {
                     "type": "map",
-                    "key-id": _MAP_IDS + 2 * number,
+                    "key-id": next(ids),
                     "key": "string",
-                    "value-id": _MAP_IDS + 2 * number + 1,
+                    "value-id": next(ids),
                     "value": kind.removeprefix("map "),
                     "value-required": False,
                 }
-            field = {"id": number, "name": name, "type": iceberg_type, "doc": meaning}
+            field = {"id": next(ids), "name": name, "type": iceberg_type, "doc": meaning}
             fields.append({**field, "required": name in KEYS})
         return IcebergSchema.model_validate({"type": "struct", "fields": fields})
 
@@ -225,22 +224,19 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def robots_condition(robots: Collection[str], day: date) -> ex.BooleanExpression:
-    """Returns the condition for the rows of robots on one day."""
-    return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
+def rows_with(**allowed: Collection[str]) -> ex.BooleanExpression:
+    """Returns the condition for the rows that have one of the allowed values in each column.
 
-
-def ids_condition(robots: Collection[str], ids: Collection[str]) -> ex.BooleanExpression:
-    """Returns the condition for the rows of robots' bags, on any day.
-
-    The bounds of the ids let Iceberg pass over the files of other times.
+    The bounds let Iceberg pass over files, none of which it compares with a long list.
     """
-    return ex.And(
-        _is(ex.In, "robot", robots),
-        _is(ex.GreaterThanOrEqual, "bag_id", min(ids)),
-        _is(ex.LessThanOrEqual, "bag_id", max(ids)),
-        _is(ex.In, "bag_id", ids),
-    )
+    if not all(allowed.values()):
+        return ex.AlwaysFalse()
+    conditions: list[ex.BooleanExpression] = []
+    for column, values in allowed.items():
+        conditions.append(_is(ex.In, column, values))
+        conditions.append(_is(ex.GreaterThanOrEqual, column, min(values)))
+        conditions.append(_is(ex.LessThanOrEqual, column, max(values)))
+    return ex.And(*conditions)
 
 
 def bags_condition(bags: Collection[tuple[str, date, str]]) -> ex.BooleanExpression:
@@ -248,11 +244,8 @@ def bags_condition(bags: Collection[tuple[str, date, str]]) -> ex.BooleanExpress
 
     No two bags have one id, so their robots and days only let Iceberg pass over other files.
     """
-    if not bags:
-        return ex.AlwaysFalse()
-    days = {day.isoformat() for _, day, _ in bags}
-    ids = {bag_id for _, _, bag_id in bags}
-    return ex.And(ids_condition({robot for robot, _, _ in bags}, ids), _is(ex.In, "day", days))
+    robots, days, ids = zip(*bags, strict=True) if bags else ((), (), ())
+    return rows_with(robot={*robots}, day={*map(date.isoformat, days)}, bag_id={*ids})
 
 
 def window_condition(

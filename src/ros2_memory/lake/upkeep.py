@@ -30,8 +30,7 @@ from ros2_memory.lake.tables import (
     TABLES,
     bags_condition,
     day_of,
-    ids_condition,
-    robots_condition,
+    rows_with,
     window_condition,
 )
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
@@ -74,7 +73,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     for name in TABLES:
         for day, robots in _to_compact(lake.days(name), closed):
             alive()
-            lake.replace(name, robots_condition(robots, day))
+            lake.replace(name, rows_with(robot=robots, day=[day.isoformat()]))
             done += len(robots)
     if done:
         log.info("days_compacted", days=done)
@@ -191,7 +190,7 @@ class Tombstone:
     def rows(self, first: str, last: str) -> BooleanExpression:
         """Returns the condition for the rows to delete; `first` and `last` are columns of times."""
         if self.bags:
-            return ids_condition([self.robot], self.bags)
+            return rows_with(robot=[self.robot], bag_id=self.bags)
         return window_condition(self.robot, (first, last), self.window, self.topics)
 
     def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
@@ -284,7 +283,7 @@ def _bags_to_forget(lake: LakeTables, tombstone: Tombstone) -> set[tuple[str, da
     of_any_topic = replace(tombstone, topics=())
     listed = _bags_where(lake, "bags", of_any_topic.rows("start_ns", "end_ns"))
     if tombstone.topics and listed:
-        ids = ids_condition([tombstone.robot], {bag_id for _, _, bag_id in listed})
+        ids = rows_with(robot=[tombstone.robot], bag_id={bag_id for _, _, bag_id in listed})
         listed -= _bags_where(lake, "channels", ids)
     return bags | listed
 

@@ -309,7 +309,7 @@ def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
     def robot(name: str, x: float | None) -> Robot:
         places = () if x is None else (Place("kitchen", "map", Circle(x, 2.0, 9.0)),)
         limits = QuerySettings(places=places)
-        return Robot(name, folder / name, fleet_memory(folder / name, limits))
+        return Robot(name, fleet_memory(folder / name, limits))
 
     robots = map(robot, NAMES, (1.0, 500.0, None))
     found = reply(Fleet(robots, FixedClock(NOW)), "visits", {"where": "kitchen"})

@@ -75,7 +75,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Six]:
 
     def robot_of(name: str) -> Robot:
         reader = Hanging(released) if name == "slow" else McapReader()
-        return Robot(name, folder / name, memory_of(folder / name, clock=clock, reader=reader))
+        return Robot(name, memory_of(folder / name, clock=clock, reader=reader))
 
     tools = tools_of(Fleet(map(robot_of, (*ROBOTS, "offline")), clock, shared_map=True))
     hung = reply_of(tools["list_frames"], {"robot": "slow"}, Call(Deadline.after(0.2)))
@@ -140,7 +140,7 @@ def test_who_cannot_answer_says_so_where_it_is_named(six: Six) -> None:
 
 def robots(count: int) -> list[Robot]:
     none: Any = None  # no memory is needed
-    return [Robot(f"r{number}", Path("bags"), none) for number in range(count)]
+    return [Robot(f"r{number}", none) for number in range(count)]
 
 
 @pytest.fixture

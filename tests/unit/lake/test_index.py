@@ -184,7 +184,7 @@ def test_bags_of_one_name_have_paths_of_their_own_and_are_all_searched(shipping:
     A question that is under way reads the bag that it found.
     """
     robot, found = shipping.robot(), list[BagFile]()
-    of_days = Robot("hall", Path("/hall"), shipping.robot(days=1, most_bags=1), in_lake=True)
+    of_days = Robot("hall", shipping.robot(days=1, most_bags=1), in_lake=True)
     for ago, label in ((4, "mug"), (0, "cup"), (2, "fork")):
         shipping.ship([START_S - ago * DAY_S], label, name="rec_0")
         bags = robot.index.refresh().bags
@@ -257,7 +257,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
         write_mcap(folder / "bags" / "rec" / f"rec_{7 - ago}.mcap", messages)
     ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
     memory = lake_robot(folder / "lake", days=1, most_bags=1)
-    return Robot("hall", Path("/hall"), memory, in_lake=True)
+    return Robot("hall", memory, in_lake=True)
 
 
 def asked(of: Robot, tool: str, label: str, topic: str = SEEN, **more: object) -> Any:
@@ -341,7 +341,7 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     topics = ("/chatter", "/dock", "/bumper", "/battery_state", "/map_name")
     ship(folder / "lake", [robot_bags("hall", folder / "bags", messages=topics)], most_bags=9)
     memory = lake_robot(folder / "lake", days=1, most_bags=1)
-    return Robot("hall", Path("/hall"), memory, in_lake=True)
+    return Robot("hall", memory, in_lake=True)
 
 
 def asked_alone(of: Robot, tool: str, **given: object) -> Any:

@@ -48,8 +48,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fleet(folder: Path) -> Fleet:
     lake = Lake(lake_in(folder / "lake"), memory_mb=256)
     shipped = lake_robots(lake, [HALL, ATTIC])
-    robots = [Robot(name, folder / name, memory) for name, memory in shipped.items()]
-    robots.append(Robot(UNSHIPPED, folder / UNSHIPPED, memory_of(folder / UNSHIPPED)))
+    robots = [Robot(name, memory) for name, memory in shipped.items()]
+    robots.append(Robot(UNSHIPPED, memory_of(folder / UNSHIPPED)))
     return Fleet(robots, FixedClock(NOW), tables=lake)
 
 
@@ -236,7 +236,7 @@ def test_a_file_that_is_damaged_is_reported_without_its_path(tmp_path: Path) -> 
     write_bag(tmp_path / HALL, 0)
     ship_from(tmp_path)
     lake = Lake(lake_in(tmp_path / "lake"))
-    fleet = Fleet([Robot(HALL, tmp_path, memory_of(tmp_path))], FixedClock(NOW), tables=lake)
+    fleet = Fleet([Robot(HALL, memory_of(tmp_path))], FixedClock(NOW), tables=lake)
     for file in (tmp_path / "lake" / "ros2_memory" / "sightings").rglob("*.parquet"):
         os.truncate(file, 4)
     answer = asked(fleet, "SELECT * FROM sightings")

@@ -87,7 +87,7 @@ def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
     pq.write_table(whole.drop_columns(["spread_m"]), path)
     lake, files = (
         Lake(lake_in(tmp_path)),
-        [LakeFile("hall", KEYS["day"], path.as_uri(), 1, 0, "", "")],
+        [LakeFile("hall", DAY, path.as_uri(), 1, 0, "", "")],
     )
     columns = ("label", "spread_m")
     assert lake.rows("things", files, columns).to_pylist() == [{"label": "cup", "spread_m": None}]

@@ -162,7 +162,7 @@ def joined(world: World, tmp_path_factory: pytest.TempPathFactory) -> Iterator[F
 
 
 def joined_memory(of_lake: Memory, own: Memory) -> Memory:
-    index = JoinedIndex(of_lake.index, own.index)
+    index = JoinedIndex(of_lake.index, own.index, own.index.bag_dir)
     assert isinstance(of_lake.reader, LakeReader)
     reader = replace(of_lake.reader, own=own.reader)
     scanner = Scanner(None, index.bag_dir)
