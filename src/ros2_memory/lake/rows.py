@@ -57,7 +57,7 @@ from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SightReader, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import pyarrow as pa
@@ -67,7 +67,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.detections import Detected
-    from ros2_memory.history.sessions import Session
     from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
@@ -117,7 +116,6 @@ def sha256_of(path: Path) -> str:
 class _Derived(NamedTuple):
     """What rows of bags that lie close together are made of; poses and events by file."""
 
-    window: TimeWindow
     poses: Mapping[str, Poses]
     events: Mapping[str, Sequence[Row]]
     things: Mapping[BagFile, Sequence[Row]]
@@ -197,26 +195,35 @@ class RowMaker:
             for rows_of_bags in scan(self._view, topic, window, copies=True):
                 for bag, positions in rows_of_bags.bag_rows(among):
                     detections[bag][topic].append(rows_of_bags.some(positions))
-        return _Derived(window, self._poses_by_file(bags, window), events, things, detections)
+        return _Derived(self._poses_by_file(bags, window), events, things, detections)
 
     def _poses_by_file(self, bags: Collection[BagFile], window: TimeWindow) -> Mapping[str, Poses]:
-        """Returns the robot's poses in each bag, by transforms where no topic has poses."""
+        """Returns the robot's poses in each bag, by transforms where no topic has poses.
+
+        Without bags of which a message has no pose. Transforms give at most twenty poses a second.
+        """
         view = self._view
+        parts: dict[str, list[Poses]] = defaultdict(list)
         if self._body is None:
-            rows = scan(view, self._path_topic, window, copies=True)
-            return _poses_by_bag(view, rows, {bag.file for bag in bags})
-        poses = {}
-        for bag in bags:
-            session = view.sessions.session_of(bag.recording)
-            of_bag = TimeWindow(bag.start, bag.end + 1)
-            poses[bag.file] = _sparse_poses(view, of_bag, session)
-        return {file: of_bag for file, of_bag in poses.items() if len(of_bag)}
+            reader, files = PoseReader(view), {bag.file for bag in bags}
+            for rows in scan(view, self._path_topic, window, copies=True):
+                for bag, positions in rows.bag_rows(files):
+                    poses = reader.poses_of_all(rows.some(positions))
+                    parts[bag.file].append(poses or NO_POSES)
+        else:
+            for bag in bags:
+                session = view.sessions.session_of(bag.recording)
+                poses = poses_by_session(view, TimeWindow(bag.start, bag.end + 1), session)
+                parts[bag.file].append(poses.rows(positions_apart(poses.times)))
+        return {
+            file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))
+        }
 
     def _rows_of_bag(
         self, bag: BagFile, shipped: ShippedBag, derived: _Derived
     ) -> Mapping[str, Iterable[Row]]:
         """Returns the rows of one bag by table, without the columns that all tables have."""
-        tracks = self._tracks(bag, derived.window)
+        tracks = self._tracks(bag)
         map_frame, track = tracks[0] if tracks else (None, empty_track())
         sightings, undecodable = self._sightings(derived.detections.get(bag, {}), map_frame, track)
         driven, stops = self._driven(derived.poses.get(bag.file))
@@ -243,11 +250,10 @@ class RowMaker:
             "bags": (shipped._asdict() | of_bag_alone,),
         }
 
-    def _tracks(self, bag: BagFile, around: TimeWindow) -> list[tuple[str, RobotTrack]]:
+    def _tracks(self, bag: BagFile) -> list[tuple[str, RobotTrack]]:
         """Returns the robot's track in the bag with its frame: in the map, and in the poses' frame.
 
-        Other rows take their places from the first track. The track in the window `around` all bags
-        is computed once, and cut; only if it cannot be, that in the bag's own window is.
+        Other rows take their places from the first track.
         """
         window = TimeWindow(bag.start, bag.end + 1)
         placement = known_placement(self._view)
@@ -256,13 +262,11 @@ class RowMaker:
         tracks: list[tuple[str, RobotTrack]] = []
         for frame in dict.fromkeys((placement.frame_id, placement.pose_frame)):
             reader = TrackReader(self._view, frame)
-            for part in (around, window):
-                # Raised if a message of the part has no position.
-                with suppress(InvalidArgumentsError):
-                    track = cut_track(reader.track_in(part.aligned(PART_NS)).track, window)
-                    if len(track.times):
-                        tracks.append((frame, track))
-                    break
+            # Raised if a message of the part has no position.
+            with suppress(InvalidArgumentsError):
+                track = cut_track(reader.track_in(window.aligned(PART_NS)).track, window)
+                if len(track.times):
+                    tracks.append((frame, track))
         return tracks
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
@@ -361,19 +365,17 @@ class RowMaker:
         return sightings, undecodable
 
     def _detected(self, rows: Rows) -> Iterator[tuple[Rows, Detected]]:
-        """Yields rows with their detections; rows of one log time one by one if any is undecodable.
+        """Yields rows with their detections; one by one if any is undecodable and some are tied.
 
-        Only then it shows which of the messages of this log time is undecodable.
+        Only then it shows which of the messages of one log time is undecodable.
         """
         detected = self._detections.read(rows)
-        lost = len(rows) - len(detected.log_times)
-        if lost and len(rows) > 1 and rows.ranks.any():
-            tied = np.isin(rows.times, rows.times[rows.ranks > 0])
-            parts = [np.flatnonzero(~tied), *np.flatnonzero(tied)[:, np.newaxis]]
-            for part in map(rows.some, parts):
-                yield part, self._detections.read(part)
-        else:
+        if len(detected.log_times) == len(rows) or not rows.ranks.any():
             yield rows, detected
+            return
+        for row in np.arange(len(rows))[:, np.newaxis]:
+            alone = rows.some(row)
+            yield alone, self._detections.read(alone)
 
     def _sighting_rows(
         self, same: Row, detected: Detected, message: IntArray, frame: str | None, track: RobotTrack
@@ -556,27 +558,3 @@ class _Messages:
             "has_payloads": payloads is not None,
             "packed": packed,
         }
-
-
-def _poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
-    """Returns by file the poses of bags, without bags in which a message has no pose.
-
-    Args:
-        view: of the call.
-        tables: all rows of a topic, of these and other bags.
-        files: the paths of the bags.
-    """
-    reader = PoseReader(view)
-    parts: dict[str, list[Poses]] = defaultdict(list)
-    for rows in tables:
-        poses = reader.poses_of_all(rows)
-        for bag, positions in rows.bag_rows(files):
-            of_bag = poses.rows(positions) if poses else reader.poses_of_all(rows.some(positions))
-            parts[bag.file].append(of_bag or NO_POSES)
-    return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
-
-
-def _sparse_poses(view: View, window: TimeWindow, session: Session) -> Poses:
-    """Returns the poses of `poses_by_session`, at most twenty a second."""
-    poses = poses_by_session(view, window, session)
-    return poses.rows(positions_apart(poses.times))
