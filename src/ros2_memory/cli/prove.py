@@ -185,7 +185,7 @@ def _parts_without_gaps(view: View) -> list[_Part]:
     derived: list[_Part] = []
     for bag in view.timeline.bags:
         if is_derived(bag.path):
-            window = TimeWindow(bag.start, bag.end + 1)
+            window = bag.window
             derived.append(_Part(bag.recording, window, bag.path.name))
             continue
         start, stop = spans.get(bag.recording, (MAX_NS, MIN_NS))

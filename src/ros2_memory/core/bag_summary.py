@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import struct
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.pauses import Absences, Pauses
 
+
+T = TypeVar("T")
 
 SetBack: TypeAlias = "tuple[Ns, Ns] | None"
 """The step back of log times, and the first log time after it; None without such a step."""
@@ -121,9 +123,7 @@ class SummarySchema:
 
     def to_json(self) -> str:
         """Returns the schema as JSON; equal schemas give equal texts."""
-        topics = [[*header] for header in self.topics]
-        values = [self.silent, self.complete, self.notes, self.set_back, self.pauses, self.absences]
-        return json.dumps([topics, *values])
+        return json.dumps([getattr(self, column.name) for column in fields(self)])
 
     @staticmethod
     def from_json(text: str) -> SummarySchema:
@@ -132,18 +132,14 @@ class SummarySchema:
         Raises:
             ValueError, TypeError: the text is not valid.
         """
-        topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
-        return shared_schema(
-            SummarySchema(
-                tuple(TopicHeader(*header) for header in topics),
-                tuple(silent),
-                complete,
-                tuple(notes),
-                None if set_back is None else tuple(set_back),
-                tuple(map(tuple, pauses)),
-                tuple((topic, tuple(map(tuple, counted))) for topic, counted in absences),
-            )
-        )
+        topics, *others = _with_tuples(json.loads(text))
+        headers = tuple(TopicHeader(*header) for header in topics)
+        return shared_schema(SummarySchema(headers, *others))
+
+
+def _with_tuples(value: T) -> T:
+    """Returns a value of JSON with tuples in place of lists."""
+    return cast("T", tuple(map(_with_tuples, value))) if isinstance(value, list) else value
 
 
 _DAMAGED: Final = "damaged"

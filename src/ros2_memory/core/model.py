@@ -196,6 +196,11 @@ class BagFile(NamedTuple):
         folder, slash, _ = self.file.rpartition("/")
         return folder_path(folder or slash)
 
+    @property
+    def window(self) -> TimeWindow:
+        """The log times of its messages."""
+        return TimeWindow(self.start, self.end + 1)
+
     def reaches_into(self, window: TimeWindow) -> bool:
         """Returns whether the bag's span overlaps a window."""
         return window.overlaps(self.start, self.end)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.layout import is_derived, is_thinned
 from ros2_memory.bag_dir.state_files import deleted_spans
 from ros2_memory.core.memo import Key
-from ros2_memory.core.model import BagFile, SetAside, TimeWindow
+from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 
@@ -151,7 +151,7 @@ def _each_day_once(
     replaced: dict[str, BagFile] = {}
     for bag in bags:
         if is_thinned(bag.file):
-            day = TimeWindow(bag.start, bag.end + 1)
+            day = bag.window
             lacks = without([(day.start, day.stop)], in_lake)
             lost_ns = _length(lacks) - _length(without(lacks, deleted))
             if day.stop - day.start - _length(lacks) > lost_ns:

@@ -178,11 +178,11 @@ class LakeIndex:
         with self._lock:
             self.lake.refresh(self.refresh_s / _LOOKS)
             window = self._window(date.max, self.days)
-            timeline = window.timeline
-            silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
-            topics, now = frozenset(silent.difference(timeline.topics())), self.clock.now()
             self.published = Snapshot(
-                timeline, silent_topics=topics, scanned_at=now, older=window.older
+                window.timeline,
+                silent_topics=window.timeline.silent - {*window.timeline.topics()},
+                scanned_at=self.clock.now(),
+                older=window.older,
             )
             return self.published
 

@@ -213,7 +213,7 @@ class RowMaker:
         else:
             for bag in bags:
                 session = view.sessions.session_of(bag.recording)
-                poses = poses_by_session(view, TimeWindow(bag.start, bag.end + 1), session)
+                poses = poses_by_session(view, bag.window, session)
                 parts[bag.file].append(poses.rows(positions_apart(poses.times)))
         return {
             file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))
@@ -255,7 +255,7 @@ class RowMaker:
 
         Other rows take their places from the first track.
         """
-        window = TimeWindow(bag.start, bag.end + 1)
+        window = bag.window
         placement = known_placement(self._view)
         if placement is None:
             return []
@@ -331,7 +331,7 @@ class RowMaker:
         """
         # By identity, since hashing a channel hashes its definition.
         by_channel: dict[int, _Messages] = {}
-        topics = {topic.topic for topic in bag.summary.topics}
+        topics = bag.summary.schema.positions.keys()
         for batch in self.memory.reader.batches(bag.path, topics, TimeWindow.everything()):
             channel = batch.channel
             if id(channel) not in by_channel:
@@ -405,7 +405,7 @@ class RowMaker:
         """Yields the messages of the topics that are shipped whole."""
         reader, extractor = self.memory.reader, self.memory.extractor
         numbers = Counter[str]()
-        topics = {*self.whole}.intersection(topic.topic for topic in bag.summary.topics)
+        topics = bag.summary.schema.positions.keys() & {*self.whole}
         if not topics:
             return
         for record in reader.records(bag.path, topics, TimeWindow.everything()):

@@ -33,7 +33,7 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError, BusyError, EpisodicError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_DAY, Clock, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, Clock, Ns
 from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
 from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, day_of, window_condition
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
@@ -484,9 +484,9 @@ class RobotBags:
         """
         new = [bag for bag in bags if bag.file not in self._states]
         if new:
-            begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
-            stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
-            of_time = window_condition(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
+            window = TimeWindow(min(bag.start for bag in new), max(bag.end for bag in new))
+            beside = window.widened(_BESIDE_NS)
+            of_time = window_condition(self.name, ("start_ns", "end_ns"), beside)
             for row in self.shipper.lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
                 self.known.setdefault(row["bag_id"], ShippedBag(**row))
 

@@ -201,10 +201,10 @@ class Tombstone:
         """
         if self.bags:
             return bag_id in self.bags
-        if not self.window.overlaps(bag.start, bag.end):
+        if not bag.reaches_into(self.window):
             return False
-        topics = {topic.topic for topic in bag.summary.topics}
-        forgotten = topics.intersection(self.topics or topics)
+        topics = bag.summary.schema.positions.keys()
+        forgotten = topics & {*(self.topics or topics)}
         return next(iter(reader.records(bag.path, forgotten, self.window)), None) is not None
 
 
