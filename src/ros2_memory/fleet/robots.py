@@ -260,9 +260,8 @@ class FanOut:
 
     def __init__(self, at_once: int = AT_ONCE) -> None:
         self._at_once = at_once
-        self._lock = threading.Lock()
-        self._late: dict[str, list[Callable[[], bool]]] = {}
-        """For each robot, whether questions are done that it did not answer in time."""
+        self._late: dict[str, set[object]] = {}
+        """For each robot, the answers that did not come in time, until they do."""
 
     def ask(
         self, robots: Sequence[Robot], work: Callable[[Robot, Call], T], call: Call
@@ -284,9 +283,10 @@ class FanOut:
                 used_active=False,
                 used_thinned=False,
             )
-            if self._is_stuck(robot):
-                late = "still busy with an earlier question that it did not finish in time"
-                return BusyError(f"{late}: is its disk reachable?"), own
+            late = self._late.setdefault(robot.name, set())
+            if late:
+                why = "still busy with an earlier question that it did not finish in time"
+                return BusyError(f"{why}: is its disk reachable?"), own
             if own.deadline.expired():
                 do = "ask about fewer robots, or a shorter time"
                 return QueryTimeoutError(f"not asked: the time of the call was up; {do}"), own
@@ -295,8 +295,8 @@ class FanOut:
             try:
                 return answer.result(min(own_s + left_s * _GRACE, threading.TIMEOUT_MAX)), own
             except TimeoutError:
-                with self._lock:
-                    self._late.setdefault(robot.name, []).append(answer.done)
+                late.add(answer)
+                answer.add_done_callback(late.discard)
                 do = "ask about it alone, or about" if is_of_several else "ask about"
                 return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window"), own
 
@@ -308,14 +308,6 @@ class FanOut:
             call.used_active |= own.used_active
             call.used_thinned |= own.used_thinned
         return {robot.name: answer for robot, (answer, _) in zip(robots, answers, strict=True)}
-
-    def _is_stuck(self, robot: Robot) -> bool:
-        """Returns whether some question is not done that the robot did not answer in time."""
-        with self._lock:
-            late = [is_done for is_done in self._late.pop(robot.name, ()) if not is_done()]
-            if late:
-                self._late[robot.name] = late
-            return bool(late)
 
 
 def _start(
