@@ -141,8 +141,8 @@ class Lake:
         sql: str,
         robots: Collection[str] | None = None,
         *,
-        most_rows: int | None = None,
-        most_chars: int | None = None,
+        most_rows: float = math.inf,
+        most_chars: float = math.inf,
         deadline: Deadline | None = None,
     ) -> Selected:
         """Returns the rows of a SELECT over the current tables; `sql` need not be trusted.

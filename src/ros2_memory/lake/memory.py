@@ -451,11 +451,9 @@ class LakeReader(BagReader):
         The size is judged by the channel in bags of the group that were read before. If none was,
         the bag is read alone: the next one may not be asked for.
         """
-        largest = 0
-        for bag_id, state in bag.group.items():
-            largest = max(
-                largest, len(self.index.lake.messages.get((bag_id, state, number)) or b"")
-            )
+        packed = self.index.lake.messages
+        known = (packed.get((bag_id, state, number)) for bag_id, state in bag.group.items())
+        largest = max(map(len, filter(None, known)), default=0)
         near = _NEAR_BYTES // (largest * topics) if largest else 0
         ids = [*bag.group]
         at = ids.index(bag.bag_id)

@@ -12,6 +12,7 @@ expressions, and functions that make rows of numbers or lists.
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
 import resource
@@ -123,14 +124,14 @@ class Select:
     Attributes:
         sql: the statement.
         memory_mb: how much memory DuckDB may use.
-        most_rows: how many rows are returned at most; None for all.
-        most_chars: how long the JSON of all rows may be; None for any length.
+        most_rows: how many rows are returned at most.
+        most_chars: how long the JSON of all rows may be.
     """
 
     sql: str
     memory_mb: int
-    most_rows: int | None = None
-    most_chars: int | None = None
+    most_rows: float = math.inf
+    most_chars: float = math.inf
 
     def run(self, tables: Mapping[str, TableFiles], deadline: Deadline) -> Selected:
         """Returns the rows, computed by a process that ends with the deadline at the latest.
@@ -209,14 +210,13 @@ class Select:
         reader = relation.to_arrow_reader(_BATCH_ROWS)
         rows: list[list[JsonValue]] = []
         chars = sum(map(len, reader.schema.names))
-        if self.most_chars is not None and chars > self.most_chars:
+        if chars > self.most_chars:
             raise InvalidArgumentsError("the names of the columns are longer than a reply may be")
         # By position: two columns may have one name.
         for row in chain.from_iterable(map(_rows_in, reader)):
             text = json.dumps(row, default=_as_json)
             chars += len(text) + 1
-            is_over = self.most_chars is not None and chars > self.most_chars
-            if is_over or len(rows) == self.most_rows:
+            if chars > self.most_chars or len(rows) == self.most_rows:
                 return Selected(reader.schema.names, rows, is_cut=True)
             rows.append(json.loads(text))
         return Selected(reader.schema.names, rows)

@@ -212,8 +212,6 @@ def _encodable(value: object) -> object:
     """Returns a value whose texts can be encoded in UTF-8."""
     if isinstance(value, str):
         return encodable(value)
-    if isinstance(value, dict):
-        return {name: _encodable(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return type(value)(map(_encodable, value))
     return value
