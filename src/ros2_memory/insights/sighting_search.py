@@ -16,13 +16,13 @@ from ros2_memory.core.arrays import stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.history.held_values import held_until, is_latched
+from ros2_memory.history.held_values import breaks_of, held_until, is_latched
 from ros2_memory.history.tested_messages import MET, NOT_MET, Block, MatchTester, Tested
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.core.arrays import Ints
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
@@ -38,8 +38,8 @@ class Run(NamedTuple):
     Attributes:
         first, last: log times (ns) of the first and the last match.
         messages: how many matches.
-        until: log time of the next message, which is no match or follows a silence; `MAX_NS` if
-            that is unknown.
+        until: log time of the next message, which is no match or follows a silence (on a latched
+            topic one of `breaks_of`); `MAX_NS` if that is unknown.
         later: how many matches after the last one have the same log time.
         begun: 1 if it is known what came before the first match, else 0.
     """
@@ -89,11 +89,14 @@ class _TopicRuns:
     Args:
         topic: its number.
         apart: whether each match is a run of its own.
+        breaks: of a latched topic: the moments, in order, through which no value holds. On another
+            topic (None) none holds through a silence.
     """
 
-    def __init__(self, topic: int, *, apart: bool) -> None:
+    def __init__(self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None) -> None:
         self._topic = topic
         self._apart = apart
+        self._breaks = None if breaks is None else np.array(breaks, np.int64)
         self._tables: list[Ints] = []
         # Whether the oldest run may go on in an older block.
         self._is_open = False
@@ -135,9 +138,9 @@ class _TopicRuns:
         self._waiting, self._messages = [], 0
         after, self._begins = self._begins, int(tested.times[0])
         times, met = tested.times, tested.met
-        goes_on = self._is_open and after - int(times[-1]) <= SILENCE_NS
-        is_silent = np.diff(times, prepend=times[0]) > SILENCE_NS
-        bounds, rows = np.flatnonzero((met == NOT_MET) | is_silent), np.flatnonzero(met == MET)
+        is_silent = self._end_before(np.append(times, after))
+        goes_on = self._is_open and not is_silent[-1]
+        bounds, rows = np.flatnonzero((met == NOT_MET) | is_silent[:-1]), np.flatnonzero(met == MET)
         if not rows.size and not bounds.size:
             self._is_open = goes_on
             return
@@ -159,6 +162,13 @@ class _TopicRuns:
         if len(runs):
             self._tables.append(runs)
         self._is_open = not self._apart and next_bound[:1].tolist() == [0]
+
+    def _end_before(self, times: Ints) -> Flags:
+        """Returns for each log time whether no run goes on to it from the one before."""
+        if self._breaks is None:
+            return np.diff(times, prepend=times[0]) > SILENCE_NS
+        broken = np.searchsorted(self._breaks, times)
+        return np.diff(broken, prepend=broken[0]) > 0
 
     def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that is not searched.
@@ -193,10 +203,14 @@ def find_runs(
     # Messages outside of a scope are not read, and may well be decodable.
     tester.ruled_out = scope.is_bounded
     topics, is_log = search.topics, view.timeline.is_log
-    latched = [topic for topic in topics if scope.is_bounded and is_latched(view, topic)]
+    breaks = {topic: breaks_of(view, topic) for topic in topics if is_latched(view, topic)}
+    latched = [topic for topic in breaks if scope.is_bounded]
     if latched:
         enough = None
-    by_topic = {topic: _TopicRuns(nth, apart=is_log(topic)) for nth, topic in enumerate(topics)}
+    by_topic = {
+        topic: _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
+        for nth, topic in enumerate(topics)
+    }
     windows = [scope.window] if latched else scope.narrowed()
     reached = scope.window.stop
     try:
@@ -253,7 +267,7 @@ def _parts_in(
 
 
 def _latched_parts(view: View, run: Run, scope: Scope) -> Iterator[Run]:
-    """Yields the parts of a scope in which a value of a latched topic held."""
+    """Yields the parts of a scope in which a value of a latched topic held; each begins with it."""
     _, end = scope.window.asked()
     until = held_until(view, run.topic, run.last, end)
     for first, stop in scope.parts_of(run.first, until):
@@ -267,7 +281,7 @@ def _latched_parts(view: View, run: Run, scope: Scope) -> Iterator[Run]:
                 last=max(first, min(run.last, stop)),
                 messages=messages,
                 later=0,
-                begun=run.begun if first == run.first else 0,
+                begun=run.begun if first == run.first else 1,
             )
 
 

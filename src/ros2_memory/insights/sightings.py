@@ -1,9 +1,9 @@
 """Sightings: consecutive matches of a condition, with where the robot and the thing were.
 
 A sighting is a run of consecutive messages of one topic that meet a condition. It ends with a
-message that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
-publish only what it sees. A message that cannot be decoded is neither a match nor an end. In a
-topic of statuses each goal is a sighting, in a log each message.
+message that does not, and, unless the topic is latched, where it is silent for longer than
+`SILENCE_NS`: a detector may publish only what it sees. A message that cannot be decoded is neither
+a match nor an end. In a topic of statuses each goal is a sighting, in a log each message.
 """
 
 from __future__ import annotations
@@ -385,8 +385,12 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
 
 def _matched_before(view: View, search: ReverseSearch, topic: str, first: Ns) -> bool:
     """Returns whether a run of matches goes on from a match before what was searched."""
-    before = view.stream.last(topic, first)
-    return before is not None and first - before.time <= SILENCE_NS and bool(search.matches(before))
+    before = held_at(view, topic, first)
+    if before is None and not is_latched(view, topic):
+        before = view.stream.last(topic, first)
+        if before is not None and first - before.time > SILENCE_NS:
+            return False
+    return before is not None and bool(search.matches(before))
 
 
 def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, Ns, bool]]:

@@ -641,3 +641,31 @@ def test_a_field_that_is_null_now_has_the_values_that_it_held(
         (None, 4.0),
     ]
     assert "has no field 'labels'" in ask(fields=["labels"], changes=True)["detail"]
+
+
+@each_way
+def test_a_latched_value_that_is_said_again_is_one_sighting(tmp_path: Path, recalls: bool) -> None:
+    """Each mode is said again after half a minute, and when the robot starts again."""
+    said = {5: "AUTO", 35: "AUTO", 65: "MANUAL", 95: "AUTO", 125: "AUTO", 155: "MANUAL"}
+    layout = McapLayout(latched=frozenset({"/mode"}))
+    for name, begin, end in (("a", 0, 110), ("b", 120, 200)):
+        run = [odom(BEGIN + at * S, at / 10) for at in range(begin, end)]
+        run += [
+            text(BEGIN + at * S, mode, "/mode") for at, mode in said.items() if begin <= at < end
+        ]
+        write_splits(tmp_path, run, 40, name, layout=layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    auto = {"topic": "/mode", "condition_type": "equals", "value": "AUTO"}
+    reply = asked(memory, "find_matches", **auto)
+    found = [
+        (row["first_seen"] - T0, row["duration_s"], row["count"]) for row in reply["sightings"]
+    ]
+    assert (found, reply["total"]) == ([(95.0, 60.0, 2), (5.0, 60.0, 2)], 2)
+
+    def counted(since: int) -> tuple[int, float]:
+        day = asked(memory, "find_matches", by="day", start=T0 + since, end=T0 + 199, **auto)
+        row = dict(zip(day["columns"][1:], day["all"], strict=True))
+        return row["count"], row["seconds"]
+
+    assert counted(0) == (2, 109.0), "for 11 s nothing was recorded"
+    assert counted(20) == (1, 94.0), "the first began before"
