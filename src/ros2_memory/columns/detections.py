@@ -40,6 +40,7 @@ from ros2_memory.messages.detections import (
     SCORES,
     Detection,
     detections_of,
+    has_more_content,
     naming_fields,
 )
 
@@ -231,11 +232,13 @@ class Json(NamedTuple):
         leaf: the text.
         depth: how many lists, objects and texts deep detections are looked for in it.
         frames: texts that may name the frame, the outermost first.
+        is_beside: whether the message has other content beside it.
     """
 
     leaf: Leaf
     depth: int
     frames: tuple[Leaf, ...]
+    is_beside: bool = False
 
 
 Source: TypeAlias = Labels | Words | Json
@@ -302,6 +305,11 @@ def _walk(node: Node, depth: int, frames: tuple[Leaf, ...], least: float | None)
         if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
             inner.append(Words(element))
         fields[name], sources = _walk(part, depth - 1, frames, least)
+        if isinstance(part, Leaf) and has_more_content(node):
+            sources = tuple(
+                source._replace(is_beside=True) if isinstance(source, Json) else source
+                for source in sources
+            )
         inner += sources
     labels = _labels(node, tuple(inner), frames)
     if labels is None:
@@ -668,7 +676,12 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     texts = values.texts(source.leaf)
     parsed = values.table.remember(
         f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
-        lambda: detections_by([detections_of(word, depth=source.depth) for word in texts.words]),
+        lambda: detections_by(
+            [
+                detections_of(word, depth=source.depth, is_beside=source.is_beside)
+                for word in texts.words
+            ]
+        ),
         lambda detections: 1000 + 100 * detections.rows.size,
     )
     if not parsed.rows.size:

@@ -4,7 +4,8 @@
   whole message. A list of strings under one of `LISTS_OF_LABELS` is a list of detections.
 - A detection of vision_msgs is named by its best hypothesis.
 - A string that is JSON is parsed. An object in it is a detection if it is in a list, has a score, a
-  place or an outline, or nothing beside its name. Otherwise it is a state.
+  place or an outline, or nothing beside its name, nor the message beside the string: else it is a
+  state, or the object of a command.
 - The place is a point in metres at one of `POSITIONS`, in the frame that the innermost object
   around it names. Boxes in an image are in pixels, and give no place.
 - The score is a number under one of `SCORES`.
@@ -52,6 +53,8 @@ _NOTHING: Final = "none"
 """The name by which JSON says that nothing was seen, without a score."""
 _NAMED_BY: Final = frozenset(LABELS).union(_NAMES_OF_SEEN, *NAMED_IN_TYPES)
 """An object without any of these fields has no name."""
+_NO_CONTENT: Final = frozenset({"header", "stamp", "timestamp", "frame_id"})
+"""Fields that a message may have beside its only content."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
 """How many lists, objects and JSON texts are opened inside each other."""
@@ -74,7 +77,7 @@ class Detection(NamedTuple):
 
 
 def detections_of(
-    value: JsonValue, frame_id: str = "", depth: int = MAX_DEPTH
+    value: JsonValue, frame_id: str = "", depth: int = MAX_DEPTH, *, is_beside: bool = False
 ) -> tuple[Detection, ...]:
     """Returns the detections in an extracted value, in order.
 
@@ -82,9 +85,10 @@ def detections_of(
         value: the value.
         frame_id: the frame of the message.
         depth: how many lists, objects and JSON texts inside each other are searched.
+        is_beside: whether the value is a text beside other content of its message.
     """
     walk = _Walk(None)
-    walk.visit(value, frame_id, depth)
+    walk.visit(value, frame_id, depth, _Inside.BESIDE if is_beside else _Inside.MESSAGE)
     return tuple(walk.detections)
 
 
@@ -114,6 +118,8 @@ class _Inside(Enum):
     """Where a value was found."""
 
     MESSAGE = auto()
+    BESIDE = auto()
+    """A text beside other content of its message, or JSON in it."""
     JSON = auto()
     JSON_LIST = auto()
 
@@ -134,7 +140,7 @@ class _Walk:
         if isinstance(value, dict):
             return self._visit_object(value, _frame(value) or frame, depth, inside)
         if isinstance(value, list):
-            if inside is _Inside.JSON:
+            if inside is not _Inside.MESSAGE:
                 inside = _Inside.JSON_LIST
             elements = [
                 self.visit(element, frame, depth - 1, inside)
@@ -145,7 +151,8 @@ class _Walk:
             return value if all(map(is_, elements, value)) else elements
         if isinstance(value, str) and looks_like_json(value):
             parsed = _parse_json(value)
-            remaining = self.visit(parsed, frame, depth - 1, _Inside.JSON)
+            inside = inside if inside is _Inside.BESIDE else _Inside.JSON
+            remaining = self.visit(parsed, frame, depth - 1, inside)
             return value if remaining is parsed else json.dumps(remaining, ensure_ascii=False)
         return value
 
@@ -165,7 +172,8 @@ class _Walk:
         parts = _Walk(self._min_score)
         remaining = parts._visit_parts(value, frame, depth, inside)
         is_something = label.strip().casefold() != _NOTHING
-        if is_something and (inside is _Inside.JSON_LIST or _has_name_alone(value)):
+        is_alone = inside is _Inside.JSON and _has_name_alone(value)
+        if is_something and (inside is _Inside.JSON_LIST or is_alone):
             # It is a detection: parts without a score describe it, and are none themselves.
             self.detections.append(detection)
             self.detections += [part for part in parts.detections if part.score is not None]
@@ -187,7 +195,10 @@ class _Walk:
                 labels = (element for element in part if isinstance(element, str) and element)
                 self.detections += map(Detection, labels)
             is_leaf = not part or isinstance(part, int | float)  # most are: no call for each
-            fields[name] = part if is_leaf else self.visit(part, frame, depth - 1, inside)
+            within = inside
+            if inside is _Inside.MESSAGE and isinstance(part, str) and has_more_content(value):
+                within = _Inside.BESIDE
+            fields[name] = part if is_leaf else self.visit(part, frame, depth - 1, within)
         return value if all(map(is_, fields.values(), value.values())) else fields
 
     def _without_low_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
@@ -206,6 +217,11 @@ class _Walk:
             return False
         score = _score(value)
         return score is not None and score < self._min_score
+
+
+def has_more_content(fields: Collection[str]) -> bool:
+    """Returns whether an object has more than one field, and a header."""
+    return sum(name not in _NO_CONTENT for name in fields) > 1
 
 
 def _has_name_alone(value: JsonObject) -> bool:

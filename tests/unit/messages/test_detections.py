@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import JsonValue
+from ros2_memory.core.reply import JsonObject
 from ros2_memory.messages.detections import (
     MAX_DEPTH,
     Detection,
@@ -112,6 +113,22 @@ def test_json_that_names_something_in_a_state_detects_nothing(
     assert [seen.label for seen in detections_of(kept)] == [
         seen.label for seen in detections_of(value) if seen.score is None
     ]
+
+
+@pytest.mark.parametrize(
+    ("beside", "labels"),
+    [
+        ({}, ["glasses"]),
+        ({"header": {"stamp": 1.0, "frame_id": ""}}, ["glasses"]),
+        ({"intent": "find_object", "confidence": 0.8}, []),
+    ],
+)
+def test_the_object_of_a_command_is_not_seen(beside: JsonObject, labels: list[str]) -> None:
+    """An intent has what the user named in a text of JSON, beside what is to be done."""
+    value: JsonValue = {**beside, "data": json.dumps({"object": "glasses"})}
+    assert [seen.label for seen in detections_of(value)] == labels
+    several = {**beside, "data": json.dumps([{"object": "glasses"}])}
+    assert [seen.label for seen in detections_of(several)] == ["glasses"]
 
 
 def test_what_lies_too_deep_is_not_looked_into() -> None:

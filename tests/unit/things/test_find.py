@@ -520,6 +520,18 @@ def test_what_a_detector_with_other_words_may_call_a_thing_is_said(
     assert told not in str(ask(tmp_path, apart, label=words[0]))
 
 
+@each_way
+def test_what_a_user_asked_for_was_not_seen(tmp_path: Path, recalls: bool) -> None:
+    """A command has its object in a text of JSON, beside what is to be done with it."""
+    key_value = "diagnostic_msgs/msg/KeyValue"
+    command = make(key_value, key="find_object", value='{"object": "glasses"}')
+    asked_for = Msg("/command", key_value, (BEGIN + 5) * S, command)
+    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), asked_for])
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert "glasses" not in str(asked(memory, "find_things"))
+    assert "glasses in view" not in str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
+
+
 @pytest.mark.parametrize("label", ["forklift", "Fork_Lift", "forklifts"])
 def test_labels_that_differ_in_spacing_only_name_one_thing(tmp_path: Path, label: str) -> None:
     """Two detectors write it otherwise, and each saw it at another time."""
