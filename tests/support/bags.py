@@ -78,6 +78,13 @@ OTHER_ROBOTS = {
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",
     "radar_msgs/msg/RadarScan": "std_msgs/Header header\nRadarReturn[] returns\n",
     "mavros_msgs/msg/StatusText": "uint8 WARNING = 4\nuint8 severity\nstring text\n",
+    "nav2_msgs/msg/BehaviorTreeStatusChange": (
+        "builtin_interfaces/Time timestamp\nstring node_name\nuint16 uid\n"
+        "string previous_status\nstring current_status\n"
+    ),
+    "nav2_msgs/msg/BehaviorTreeLog": (
+        "builtin_interfaces/Time timestamp\nBehaviorTreeStatusChange[] event_log\n"
+    ),
     "unitree_go/msg/IMUState": "float32[4] quaternion\n",
     "unitree_go/msg/SportModeState": (
         "uint32 error_code\nIMUState imu_state\nuint8 mode\nuint8 gait_type\nfloat32[3] position\n"

@@ -46,6 +46,7 @@ _LOGS: Final = FOXGLOVE_LOGS | {
     "rcl_interfaces/msg/Log",
     "rcl_interfaces/Log",
     "mavros_msgs/msg/StatusText",
+    "nav2_msgs/msg/BehaviorTreeLog",
 }
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""

@@ -25,7 +25,9 @@ from tests.support.bags import (
     detections,
     goals,
     log_entry,
+    make,
     odom,
+    stamp,
     write_mcap,
     write_splits,
 )
@@ -186,6 +188,9 @@ def test_an_action_that_nobody_calls_is_not_silent(tmp_path: Path) -> None:
     messages += [boolean(BEGIN + t * S + 2, True, topic="/drive/_action/feedback") for t in called]
     messages += [boolean(BEGIN + t * S + 3, True, topic="/bumper") for t in called]
     messages += [boolean(BEGIN + t * S + 4, True, topic="/arm/_service_event") for t in called]
+    tree = "nav2_msgs/msg/BehaviorTreeLog"
+    ticked = make(tree, timestamp=stamp(BEGIN), event_log=[])
+    messages += [Msg("/behavior_tree_log", tree, BEGIN + t * S + 5, ticked) for t in called]
     messages.sort(key=lambda message: message.log_time)
     memory = remembered(tmp_path, messages)
     status = asked(memory, "memory_status")
