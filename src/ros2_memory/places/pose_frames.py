@@ -385,10 +385,13 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
     """Notes if positions outside of the map are of several runs of odometry."""
     if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
         root = root_above(view, frame_id)
-        advice = f"; transforms lead from it to {root}: if that is a map, set data.map_frame={root}"
+        advice = f"ask with frame_id={root}"
+        if root != view.limits.map_frame:
+            advice = f"if that is a map, set data.map_frame={root}"
+        leads = f"; transforms lead from it to {root}: {advice}" if root else ""
         view.notes.add(
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
-            f"coordinates may be another place in each{advice if root else ''}"
+            f"coordinates may be another place in each{leads}"
         )
 
 

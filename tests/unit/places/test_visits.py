@@ -418,13 +418,16 @@ def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
     assert "changes with every start" not in notes
 
 
-def test_of_several_runs_the_note_names_the_frame_that_may_be_the_map(tmp_path: Path) -> None:
+@pytest.mark.parametrize("root", ["site", "map"])
+def test_of_several_runs_the_note_names_the_frame_that_is_or_may_be_the_map(
+    tmp_path: Path, root: str
+) -> None:
     for nth in range(2):
         begin = (1_784_000_000 + nth * 1000) * 10**9
         moved = [
             tf(
                 at := begin + n * 10**8,
-                transform(at, "site", "vision", (0.0, 0.0, 0.0)),
+                transform(at, root, "vision", (0.0, 0.0, 0.0)),
                 transform(at, "vision", "base_link", (n / 50, 0.0, 0.0)),
             )
             for n in range(100)
@@ -433,5 +436,11 @@ def test_of_several_runs_the_note_names_the_frame_that_may_be_the_map(tmp_path: 
         for pose in poses:
             pose.body.header.frame_id = "vision"  # type: ignore[attr-defined]
         write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", [*moved, *poses])
+    window = {"start": 1_784_000_000, "end": 1_784_002_000}
+    notes = asked(memory_of(tmp_path), "trajectory_summary", **window)["notes"]
+    advice = {"site": "if that is a map, set data.map_frame=site", "map": "ask with frame_id=map"}
+    assert f"lead from it to {root}: {advice[root]}" in str(notes)
+    if root == "map":
+        return
     notes = asked(memory_of(tmp_path), "visits", x=1.0, y=0.0, radius_m=0.2)["notes"]
     assert "lead from it to site: if that is a map, set data.map_frame=site" in str(notes)
