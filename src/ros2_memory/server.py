@@ -28,7 +28,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.serving.listen import Address, CannotListenError, resolve
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from starlette.routing import Route
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
+    from ros2_memory.serving.auth import Tokens
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.health import FleetHealth, Health
     from ros2_memory.serving.mcp_server import EpisodicServer
@@ -122,30 +123,26 @@ class _HttpEndpoint(NamedTuple):
 
     Attributes:
         address: where it listens.
-        token: for everything; None if none is needed.
-        limited: other tokens, each with the robots of a fleet that it is for.
+        tokens: of its clients; none if none is needed.
     """
 
     address: Address
-    token: str | None
-    limited: Mapping[str, frozenset[str]]
+    tokens: Tokens
 
 
 def _http_endpoint(settings: Settings) -> _HttpEndpoint:
-    """Returns the endpoint of the settings, and takes the token out of the environment.
+    """Returns the endpoint of the settings, and takes the API token out of the environment.
 
     Raises:
         CannotListenError: the host has no address.
         ConfigError: a token is missing, or cannot be used.
     """
-    from ros2_memory.serving.auth import limited_tokens, take_token
+    from ros2_memory.serving.auth import take_tokens
 
     host = settings.server.host
     address = resolve(host, settings.server.port)
-    files = settings.fleet.tokens
-    token = take_token(os.environ, host=host, loopback=address.is_loopback, limited=bool(files))
-    limited = limited_tokens(files, token)
-    return _HttpEndpoint(address, token.get_secret_value() if token else None, limited)
+    files, is_local = settings.fleet.tokens, address.is_loopback
+    return _HttpEndpoint(address, take_tokens(os.environ, files, host=host, loopback=is_local))
 
 
 def _log_start(settings: Settings, fleet: Fleet | None) -> None:
@@ -181,10 +178,9 @@ def _serve_http(
         host=endpoint.address.host,
         health=parts.health,
         background=parts.background,
-        api_token=endpoint.token,
+        tokens=endpoint.tokens,
         metrics=telemetry.metrics,
         page=parts.page,
-        limited=endpoint.limited,
     )
     show_page = None if page is None or parts.page is None else partial(_show_page, page)
     serve_http(app, endpoint.address, parts.server.dispatcher, show_page)
@@ -207,13 +203,13 @@ class _Parts(NamedTuple):
     Attributes:
         server: answers MCP.
         health: reports for `/health`.
-        background: keeps indexes fresh and stores full, until it is cancelled.
+        background: keep indexes fresh and stores full, until they are cancelled.
         page: the routes of the page's data; None without a page.
     """
 
     server: EpisodicServer
     health: Health | FleetHealth
-    background: Background
+    background: Sequence[Background]
     page: Sequence[Route] | None
 
 
@@ -224,8 +220,6 @@ def _parts_of_one(
     from ros2_memory.serving.health import Health, keep_fresh, refresh_logged
 
     threading.Thread(target=refresh_logged, args=(memory,), name="first scan").start()
-    import anyio
-
     from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.serving.backfill import keep_backfilled
 
@@ -238,12 +232,10 @@ def _parts_of_one(
 
         page = page_routes(server.dispatcher, backfill.progress)
 
-    async def background() -> None:
-        """Keeps the index fresh and the store of columns full, until it is cancelled."""
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_fresh, memory, every_s)
-            tasks.start_soon(keep_backfilled, backfill, every_s)
-
+    background = (
+        partial(keep_fresh, memory, every_s),
+        partial(keep_backfilled, backfill, every_s),
+    )
     return _Parts(server, Health(memory, backfill), background, page)
 
 
@@ -255,8 +247,6 @@ def _parts_of_fleet(
     overrides: Sequence[str],
 ) -> _Parts:
     """Returns the parts of a fleet's server. It has no page, which shows one robot."""
-    import anyio
-
     from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.bootstrap_fleet import robot_settings
     from ros2_memory.serving.backfill import keep_all_backfilled
@@ -280,13 +270,11 @@ def _parts_of_fleet(
         bags = robot.own or robot.memory
         reports[name] = Health(bags, backfill_of(name))
 
-    async def background() -> None:
-        """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
-        every_s = settings.reader.index_refresh_s
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_fleet_fresh, fleet, every_s)
-            tasks.start_soon(keep_all_backfilled, all_backfills, every_s)
-
+    every_s = settings.reader.index_refresh_s
+    background = (
+        partial(keep_fleet_fresh, fleet, every_s),
+        partial(keep_all_backfilled, all_backfills, every_s),
+    )
     server = build_server(settings, memory, telemetry, fleet=fleet)
     return _Parts(server, FleetHealth(reports), background, None)
 
@@ -383,7 +371,8 @@ async def _serve_stdio(parts: _Parts) -> None:
     import anyio
 
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(parts.background)
+        for keep in parts.background:
+            tasks.start_soon(keep)
         await parts.server.run_stdio_async()
         tasks.cancel_scope.cancel()
 

@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import anyio
 import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
@@ -47,7 +46,7 @@ async def serving(server: EpisodicServer) -> AsyncIterator[int]:
     async def health() -> Any:
         return {"status": "ok"}
 
-    app = web_app(server, host="127.0.0.1", health=health, background=anyio.sleep_forever)
+    app = web_app(server, host="127.0.0.1", health=health)
     async with listening(app, lifespan="on") as running:
         yield running.servers[0].sockets[0].getsockname()[1]
 

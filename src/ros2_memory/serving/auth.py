@@ -22,7 +22,7 @@ import socket
 import stat
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
@@ -75,6 +75,10 @@ _HOST: Final = re.compile(r"(?:([A-Za-z0-9._-]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]*
 log = get_logger(__name__)
 
 
+Tokens: TypeAlias = "Mapping[str, frozenset[str] | None]"
+"""Tokens, each with the robots that it is for; None for everything."""
+
+
 class Access(NamedTuple):
     """What a token is for: questions about some robots, or everything where `robots` is None."""
 
@@ -102,23 +106,17 @@ class TokenGate:
 
     Args:
         app: receives the requests.
-        token: is for everything; None if there is no such token.
+        tokens: a limited one is for the questions of MCP alone; for `/health` it counts as none.
         monotonic: seconds.
-        limited: tokens for the questions of MCP alone, each with the robots that it is for. For
-            `/health` such a token counts as none.
     """
 
     def __init__(
         self,
         app: ASGIApp,
-        token: str | None,
+        tokens: Tokens,
         monotonic: Callable[[], float] = time.monotonic,
-        limited: Mapping[str, frozenset[str]] | None = None,
     ) -> None:
         self._app = app
-        tokens: dict[str, frozenset[str] | None] = {**(limited or {})}
-        if token is not None:
-            tokens[token] = None
         self._access_by_digest = {
             _digest(text.encode("ascii")): Access(robots) for text, robots in tokens.items()
         }
@@ -303,55 +301,44 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     return None
 
 
-def limited_tokens(
-    robots: Mapping[Path, Sequence[str]], for_all: SecretStr | None
-) -> dict[str, frozenset[str]]:
-    """Reads the tokens in files, and returns each with the robots that it is for.
+def take_tokens(
+    env: MutableMapping[str, str], files: Mapping[Path, Sequence[str]], *, host: str, loopback: bool
+) -> Tokens:
+    """Returns the tokens of a server.
+
+    Removes the API token from the environment of child processes.
 
     Args:
-        robots: by file, the robots that its token is for.
-        for_all: the API token, which is for everything.
-
-    Raises:
-        ConfigError: a file cannot be read, its token cannot be used, or two have the same one, or
-            one has the API token.
-    """
-    tokens: dict[str, frozenset[str]] = {}
-    for path, names in robots.items():
-        source = f"fleet.tokens: {path}"
-        text = _read_token(path, source)
-        if text in tokens:
-            raise ConfigError(f"{source}: another file has the same token; {_HOW}")
-        if for_all is not None and text == for_all.get_secret_value():
-            raise ConfigError(f"{source}: it is the API token, which is for everything; {_HOW}")
-        tokens[text] = frozenset(names)
-    return tokens
-
-
-def take_token(
-    env: MutableMapping[str, str], *, host: str, loopback: bool, limited: bool = False
-) -> SecretStr | None:
-    """Returns the token of a server, and removes it from the environment of child processes.
-
-    Args:
-        env: the environment.
+        env: the environment, which names the API token.
+        files: the files of limited tokens, each with the robots that its token is for.
         host: the address that the server listens on.
         loopback: whether only this machine can reach it, so that no token is needed.
-        limited: whether there are limited tokens, so that no token for everything is needed.
 
     Raises:
-        ConfigError: a token is missing, or cannot be used.
+        ConfigError: a token is missing, cannot be read or used, or is given twice.
     """
     token = api_token(env)
     env.pop(VARIABLE, None)
-    if token is None and not loopback and not limited:
+    if token is None and not loopback and not files:
         raise ConfigError(
             f"{VARIABLE}: missing; server.host is {host!r}, which other machines can reach, so "
             f"clients must send a token: {_HOW} and give it as {VARIABLE}, in a file that "
             f"{FILE_VARIABLE} names, or by LoadCredential={CREDENTIAL}:PATH in a systemd unit; "
             "or listen on 127.0.0.1, where none is needed"
         )
-    return token
+    tokens: dict[str, frozenset[str] | None] = {}
+    if token is not None:
+        tokens[token.get_secret_value()] = None
+    for path, names in files.items():
+        source = f"fleet.tokens: {path}"
+        text = _read_token(path, source)
+        if text in tokens:
+            why = "another file has the same token"
+            if tokens[text] is None:
+                why = "it is the API token, which is for everything"
+            raise ConfigError(f"{source}: {why}; {_HOW}")
+        tokens[text] = frozenset(names)
+    return tokens
 
 
 def _read_token(given: str | Path, source: str) -> str:

@@ -115,6 +115,7 @@ class Dispatcher:
         most_questions: how many calls are kept for the page.
 
     Attributes:
+        tools: those that clients see, by name.
         readable: the tools that a resource can use, by name.
         blocking: the queue of the tools that are declared as blocking.
         quick: the queue of all other tools.
@@ -132,11 +133,10 @@ class Dispatcher:
         log_arguments: bool = True,
         most_questions: int = 0,
     ) -> None:
-        self.tools = (*tools,)
         self.questions = QuestionLog(most_questions)
         self.memory = memory
-        self._tools = {tool.name: tool for tool in tools}
-        self.readable = self._tools | {tool.name: tool for tool in readable}
+        self.tools = {tool.name: tool for tool in tools}
+        self.readable = self.tools | {tool.name: tool for tool in readable}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
@@ -173,7 +173,7 @@ class Dispatcher:
             robots: the robots of a fleet that the client may ask about; None for all.
             part: returns the part of the memory that answers; tools that write are refused then.
         """
-        tools = self.readable if for_resource else self._tools
+        tools = self.readable if for_resource else self.tools
         begun = time.perf_counter_ns()
         outcome, reply = "cancelled", Reply("")
         with self._running_call() as (call, correlation_id):

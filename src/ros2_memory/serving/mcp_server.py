@@ -164,9 +164,9 @@ class EpisodicServer(MCPServer[object]):
         )
         self._progress = progress
         self.dispatcher = dispatcher
-        self._listed_tools = [_listed_tool(tool) for tool in dispatcher.tools]
-        has_status = any(tool.name == "memory_status" for tool in dispatcher.tools)
-        self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
+        self._listed_tools = [*map(_listed_tool, dispatcher.tools.values())]
+        additions = "memory_status" in dispatcher.tools
+        self._prompt = f"{instructions}\n{prompt(additions=additions)}"
         self._resources = {
             tool: resource for tool, resource in RESOURCES.items() if tool in dispatcher.readable
         }

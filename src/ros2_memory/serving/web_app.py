@@ -30,7 +30,7 @@ from ros2_memory.serving.connection_limits import RequestLimits
 from ros2_memory.serving.page import Page
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 
     from mcp.server.mcpserver import MCPServer
     from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.telemetry import Exposition
+    from ros2_memory.serving.auth import Tokens
 
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
@@ -84,11 +85,10 @@ def web_app(
     *,
     host: str,
     health: Callable[[], Awaitable[JsonObject]],
-    background: Background,
-    api_token: str | None = None,
+    background: Sequence[Background] = (),
+    tokens: Tokens | None = None,
     metrics: Callable[[], Awaitable[Exposition]] | None = None,
     page: Sequence[Route] | None = (),
-    limited: Mapping[str, frozenset[str]] | None = None,
 ) -> ASGIApp:
     """Returns the application that listens on `host`.
 
@@ -96,14 +96,12 @@ def web_app(
         server: answers `/sse`, `/messages/` and `/mcp`.
         host: the name or address that it listens on.
         health: returns the report of `/health`.
-        background: runs from start to end of the application, and is cancelled then.
-        api_token: demanded of every request, if there is one. Requests without it see only the
-            status of `/health`, and the page, which holds no data and asks for it.
+        background: run from start to end of the application, and are cancelled then.
+        tokens: one is demanded of every request, if there are any. Requests without it see only
+            the status of `/health`, and the page, which holds no data and asks for it.
         metrics: returns the text of `/metrics`; without it there is no such path.
         page: the routes of the page's data; None for a server without a page.
-        limited: other tokens, each with the robots of a fleet that it is for.
     """
-    needs_token = api_token is not None or bool(limited)
     # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
     unguarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     streams = server.sse_app(sse_path=STREAM_PATH, transport_security=unguarded)
@@ -114,7 +112,8 @@ def web_app(
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
         async with plain.run(), streaming.run(), anyio.create_task_group() as tasks:
-            tasks.start_soon(background)
+            for keep in background:
+                tasks.start_soon(keep)
             yield
             tasks.cancel_scope.cancel()
 
@@ -127,12 +126,12 @@ def web_app(
     if metrics is not None:
         routes.append(_metrics_route(metrics))
     app: ASGIApp = RequestLimits(Starlette(routes=routes, lifespan=lifespan))
-    if needs_token:
-        app = TokenGate(app, api_token, limited=limited)
+    if tokens:
+        app = TokenGate(app, tokens)
     if page is not None:
         # The page comes before the token: it holds no data, and asks for the token.
         app = Page(app)
-    return ForgeryGuard(app, host, admits=not needs_token)
+    return ForgeryGuard(app, host, admits=not tokens)
 
 
 def _health_routes(health: Callable[[], Awaitable[JsonObject]]) -> list[Route]:

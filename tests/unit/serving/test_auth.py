@@ -11,7 +11,6 @@ import httpx2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import SecretStr
 from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
@@ -23,10 +22,10 @@ from ros2_memory.serving.auth import (
     LONGEST_TOKEN,
     SHORTEST_TOKEN,
     TokenGate,
+    Tokens,
     access_of,
     api_token,
-    limited_tokens,
-    take_token,
+    take_tokens,
 )
 from ros2_memory.serving.listen import CannotListenError, listen, resolve
 
@@ -46,7 +45,7 @@ class Inside:
 
 
 async def asked(inside: Inside, path: str = "/mcp", **headers: str) -> httpx2.Response:
-    transport = httpx2.ASGITransport(app=TokenGate(inside, GOOD))
+    transport = httpx2.ASGITransport(app=TokenGate(inside, {GOOD: None}))
     async with httpx2.AsyncClient(transport=transport, base_url="http://robot") as http:
         return await http.get(path, headers=headers)
 
@@ -132,7 +131,7 @@ async def test_no_other_bytes_open_it(shown: bytes) -> None:
     for headers in ([shown], [b"Bearer " + shown], twice):
         named = [(b"authorization", header) for header in headers]
         scope: Any = {"type": "http", "path": "/mcp", "headers": named}
-        await TokenGate(inside, GOOD)(scope, receive, send)
+        await TokenGate(inside, {GOOD: None})(scope, receive, send)
     assert [each["status"] for each in sent if "status" in each] == [401] * 3
     assert inside.seen == []
 
@@ -154,7 +153,7 @@ async def test_tokens_are_compared_in_constant_time(monkeypatch: pytest.MonkeyPa
 
 async def test_refusals_are_logged_now_and_then_with_nothing_of_what_was_sent() -> None:
     now = [0.0]
-    gate = TokenGate(Inside(), GOOD, monotonic=lambda: now[0])
+    gate = TokenGate(Inside(), {GOOD: None}, monotonic=lambda: now[0])
     transport = httpx2.ASGITransport(app=gate, client=("192.0.2.7", 4711))
     with capture_logs() as events:
         async with httpx2.AsyncClient(transport=transport, base_url="http://robot") as http:
@@ -238,11 +237,15 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 
 def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_not() -> None:
     for none in ({}, {"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}):
-        assert take_token(none, host="127.0.0.1", loopback=True) is None
+        assert take_tokens(none, {}, host="127.0.0.1", loopback=True) == {}
     env = {"MEMORY_API_TOKEN": GOOD, "PATH": "/bin"}
-    assert take_token(env, host="127.0.0.1", loopback=True)
+    assert take_tokens(env, {}, host="127.0.0.1", loopback=True) == {GOOD: None}
     assert env == {"PATH": "/bin"}
     assert "MEMORY_API_TOKEN" not in without_ours({"MEMORY_API_TOKEN": GOOD})
+
+
+def taken(env: dict[str, str], files: dict[Path, list[str]]) -> Tokens:
+    return take_tokens(env, files, host="10.0.0.1", loopback=False)
 
 
 def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) -> None:
@@ -251,10 +254,11 @@ def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) ->
     site.write_text(f"{GOOD}\n")
     other.write_text("another-0123456789")
     with pytest.raises(ConfigError, match="site: it is the API token") as refusal:
-        limited_tokens({other: ["r2"], site: ["r1"]}, SecretStr(GOOD))
+        taken({"MEMORY_API_TOKEN": GOOD}, {other: ["r2"], site: ["r1"]})
     assert GOOD not in str(refusal.value)
-    tokens = limited_tokens({site: ["r1"]}, SecretStr(f"{GOOD[:-1]}0"))
-    assert tokens == limited_tokens({site: ["r1"]}, None) == {GOOD: frozenset({"r1"})}
+    limited, another = {GOOD: frozenset({"r1"})}, "another-0123456789"
+    assert taken({"MEMORY_API_TOKEN": another}, {site: ["r1"]}) == {another: None, **limited}
+    assert taken({}, {site: ["r1"]}) == limited
 
 
 def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path: Path) -> None:

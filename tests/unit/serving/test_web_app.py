@@ -40,8 +40,7 @@ def app(
         server,
         host=host,
         health=health,
-        background=anyio.sleep_forever,
-        api_token=api_token,
+        tokens={api_token: None} if api_token else {},
         page=page_routes(server.dispatcher),
     )
 

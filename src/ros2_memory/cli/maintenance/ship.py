@@ -69,7 +69,7 @@ def ship(
             service.run()
         location.claim()
         if forget is not None and window is not None:
-            return _forget(location, forget, window, robots, as_json=as_json)
+            return service.forget(forget, window, as_json=as_json)
         with service.open_shipper() as shipper:
             done = shipper.run()
             shipper.keep_up(service.grace)
@@ -84,7 +84,7 @@ def ship(
             print_line(f"forgotten as on the robot: {counted(done.forgotten, 'bag')}")
         print_notes(done.problems)
     if done.forgotten:
-        _note_versions(location)
+        service.note_versions()
     return bool(done.waiting or done.problems)
 
 
@@ -99,56 +99,6 @@ def _window_to_forget(robot: str | None, times: Times) -> TimeWindow | None:
     if robot is None or not times.are_bounded:
         raise InvalidArgumentsError(f"give --forget ROBOT and a time to forget: {BOUNDED}")
     return times.window_at(time.time())
-
-
-def _forget(
-    location: "LakeLocation",
-    robot: str,
-    window: TimeWindow,
-    robots: "Sequence[RobotBags]",
-    *,
-    as_json: bool,
-) -> bool:
-    """Forgets a window of a robot in the lake, and prints what is gone.
-
-    Returns whether something of it stays.
-
-    Raises:
-        InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is done.
-        LakeError: the lake cannot be read or written; the next start finishes it.
-    """
-    from ros2_memory.lake.upkeep import Tombstone, append_tombstone, forget_in_lake  # noqa: PLC0415
-
-    tombstone = Tombstone(robot, window.start, window.stop)
-    with location.writable() as lake:
-        names = {*lake.days("bags"), *(configured.name for configured in robots)}
-        if robot not in names:
-            raise InvalidArgumentsError(
-                f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
-                f"{listed(sorted(names))}"
-            )
-        failures: list[str] = []
-        for configured in robots:
-            if configured.name == robot:
-                failures += configured.forget([window])
-        append_tombstone(location.state_dir, tombstone, done=False)
-        gone = forget_in_lake(lake, tombstone)
-    kept_by = [*gone.kept_by]
-    if as_json:
-        print_json({"bags": gone.bags, "files": gone.files, "kept_by": kept_by})
-    else:
-        bags = counted(gone.bags, "bag")
-        print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
-        print_notes([f"a branch or tag keeps an older version: {name}" for name in kept_by])
-    print_notes(failures)
-    _note_versions(location)
-    return bool(kept_by or failures)
-
-
-def _note_versions(location: "LakeLocation") -> None:
-    """Notes that a bucket may keep versions of objects that were deleted."""
-    if not location.warehouse.startswith("file:"):
-        print_notes(["where the bucket keeps versions of deleted objects, those are not erased"])
 
 
 def _wait(seconds: float) -> None:
@@ -215,6 +165,54 @@ class _ShippingService:
             _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
         self.committed_s = time.monotonic()
         self.location.claim()
+
+    def forget(self, robot: str, window: TimeWindow, *, as_json: bool) -> bool:
+        """Forgets a window of a robot in the lake, and prints what is gone.
+
+        Returns whether something of it stays.
+
+        Raises:
+            InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is
+                done.
+            LakeError: the lake cannot be read or written; the next start finishes it.
+        """
+        from ros2_memory.lake.upkeep import (  # noqa: PLC0415
+            Tombstone,
+            append_tombstone,
+            forget_in_lake,
+        )
+
+        tombstone = Tombstone(robot, window.start, window.stop)
+        with self.location.writable() as lake:
+            names = {*lake.days("bags"), *(configured.name for configured in self.robots)}
+            if robot not in names:
+                raise InvalidArgumentsError(
+                    f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; "
+                    f"there are: {listed(sorted(names))}"
+                )
+            failures: list[str] = []
+            for configured in self.robots:
+                if configured.name == robot:
+                    failures += configured.forget([window])
+            append_tombstone(self.location.state_dir, tombstone, done=False)
+            gone = forget_in_lake(lake, tombstone)
+        kept_by = [*gone.kept_by]
+        if as_json:
+            print_json({"bags": gone.bags, "files": gone.files, "kept_by": kept_by})
+        else:
+            bags = counted(gone.bags, "bag")
+            print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
+            print_notes([f"a branch or tag keeps an older version: {name}" for name in kept_by])
+        print_notes(failures)
+        self.note_versions()
+        return bool(kept_by or failures)
+
+    def note_versions(self) -> None:
+        """Notes that a bucket may keep versions of objects that were deleted."""
+        if not self.location.warehouse.startswith("file:"):
+            print_notes(
+                ["where the bucket keeps versions of deleted objects, those are not erased"]
+            )
 
     def run(self) -> NoReturn:
         """Ships until the process is stopped; a lake that fails is tried again."""
