@@ -102,16 +102,16 @@ def ask(
     memory = open_memory(loaded, verbose=verbose, allows_fleet=True)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     if not question:
-        _print_tools(dispatcher.tools, as_json=as_json)
+        _print_tools(dispatcher.tools.values(), as_json=as_json)
         return False
     # A folder that does not exist may stand before the tool.
-    tools = {tool.name: tool.arguments for tool in dispatcher.tools}
-    name = next((word for word in question if word in tools), question[0])
+    name = next((word for word in question if word in dispatcher.tools), question[0])
     arguments = [word for word in question if word and word != name]
     with spinner(f"asking {name}"):
         if fleet is not None:
             with suppress(InvalidArgumentsError):  # the tool refuses such arguments itself
-                robot = parse_arguments(arguments, tools.get(name, {})).get("robot")
+                schemas = _schemas_of(dispatcher, name)
+                robot = parse_arguments(arguments, schemas).get("robot")
                 call = Call(Deadline.after(loaded.server.call_timeout_s))
                 memory = fleet.newest(robot, call) or memory
         reply = answer_to(dispatcher, memory, name, arguments)
@@ -153,14 +153,18 @@ def answer_to(dispatcher: Dispatcher, memory: Memory, name: str, words: Sequence
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
     """
-    tool = next((tool for tool in dispatcher.tools if tool.name == name), None)
-    schemas = {} if tool is None else tool.arguments
+    schemas = _schemas_of(dispatcher, name)
     now = unix_from_ns(present_time(memory))
     arguments = {
         key: _with_parsed_times(value, schemas.get(key), now)
         for key, value in parse_arguments(words, schemas).items()
     }
     return call_once(dispatcher, name, arguments)
+
+
+def _schemas_of(dispatcher: Dispatcher, name: str) -> Mapping[str, JsonObject]:
+    """Returns the JSON schemas of a tool's arguments; none of a tool that is not offered."""
+    return dispatcher.tools[name].arguments if name in dispatcher.tools else {}
 
 
 def call_once(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:

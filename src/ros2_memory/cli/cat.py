@@ -10,9 +10,9 @@ import typer
 from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import Bags, Times
 from ros2_memory.cli.output import (
+    filled_leaves,
     format_time,
     format_value,
-    leaves,
     print_exactly,
     print_notes,
 )
@@ -137,7 +137,7 @@ def _csv_lines(rows: Iterable[Row]) -> Iterator[str]:
     columns: list[str] | None = None
     without_column: set[str] = set()
     for time, value in rows:
-        cells = {path or "value": inner for path, inner in leaves(value)}
+        cells = {path or "value": inner for path, inner in filled_leaves(value).items()}
         if columns is None:
             columns = [*cells]
             yield csv_line(["time", *columns])

@@ -8,7 +8,7 @@ import yaml
 
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_given
-from ros2_memory.cli.output import leaves, print_json, print_line
+from ros2_memory.cli.output import filled_leaves, print_json, print_line
 from ros2_memory.config import files_in_use, plain_values
 
 _MASK: Final = "********"
@@ -28,7 +28,7 @@ def config_show(words: Words = None, bag_dir: BagDir = None, as_json: AsJson = F
     settings = load_given(bag_dir, words)
     values = plain_values(settings)
     if as_json:
-        print_json(dict(leaves(values)))
+        print_json(filled_leaves(values))
         return
     print_line(yaml.safe_dump(values, sort_keys=False, allow_unicode=True).rstrip())
     for path in files_in_use(settings):

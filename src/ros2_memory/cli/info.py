@@ -11,7 +11,7 @@ from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_once
 from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
 from ros2_memory.cli.output import (
-    leaves,
+    filled_leaves,
     print_json,
     print_line,
     print_notes,
@@ -106,7 +106,7 @@ def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
     if not any(files):
         _print_nothing(memory)
         return
-    values = {key: value for part in report.values() for key, value in leaves(part)}
+    values = {key: value for part in report.values() for key, value in filled_leaves(part).items()}
     for key, value in [*values.items()]:
         if value in (None, []) or key.endswith("_local"):
             del values[key]

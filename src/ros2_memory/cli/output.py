@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.text import dotted
+from ros2_memory.core.text import leaves
 from ros2_memory.core.timebase import NS_PER_US, local_time
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _print_object(reply: Mapping[str, JsonValue]) -> None:
     lines: dict[str, str] = {}
     tables: dict[str, list[JsonObject]] = {}
     notes: list[str] = []
-    for path, value in leaves(_with_rows_as_objects(reply)):
+    for path, value in filled_leaves(_with_rows_as_objects(reply)).items():
         if rows := _objects(value):
             tables[path] = rows
         elif path == "notes" and isinstance(value, list):
@@ -149,7 +149,7 @@ def _objects(value: JsonValue) -> list[JsonObject]:
 
 def _print_rows(rows: Sequence[JsonObject]) -> None:
     """Prints a table, or one object after the other where its columns would be too narrow."""
-    flat = [dict(leaves(row)) for row in rows]
+    flat = [*map(filled_leaves, rows)]
     columns = dict.fromkeys(path for row in flat for path in row)
     width = get_terminal_size(_NO_TERMINAL).columns
     if len(columns) * _LEAST_WIDTH > width:
@@ -165,13 +165,9 @@ def _print_rows(rows: Sequence[JsonObject]) -> None:
     Console(width=width).print(table)
 
 
-def leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields the values inside nested objects, each with its dot-path; a list is one value."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from leaves(inner, dotted(path, key))
-    else:
-        yield path, value
+def filled_leaves(value: JsonValue) -> dict[str, JsonValue]:
+    """Returns the values inside nested objects by dot-path, without empty objects."""
+    return {path: inner for path, inner in leaves(value) if inner != {}}
 
 
 def plain_cell(cell: JsonValue) -> JsonValue:
@@ -193,9 +189,8 @@ def format_value(value: JsonValue) -> str:
     if isinstance(value, list):
         separator = " | " if _objects(value) else ", "
         return separator.join(map(format_value, value)) or "-"
-    return (
-        "; ".join(f"{escape(path)}: {format_value(inner)}" for path, inner in leaves(value)) or "-"
-    )
+    parts = [f"{escape(path)}: {format_value(part)}" for path, part in filled_leaves(value).items()]
+    return "; ".join(parts) or "-"
 
 
 def format_time(unix_s: float) -> str:

@@ -111,6 +111,15 @@ def dotted(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
+def leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields the innermost values of nested objects by dot-path; a list, or {}, is one value."""
+    if isinstance(value, dict) and value:
+        for name, inner in value.items():
+            yield from leaves(inner, dotted(path, name))
+    else:
+        yield path, value
+
+
 def counted(count: int, singular: str, plural: str | None = None) -> str:
     """Returns a number and its noun: `1 jump`, `2 jumps`."""
     return f"{count} {singular if count == 1 else plural or singular + 's'}"

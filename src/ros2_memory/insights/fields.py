@@ -9,7 +9,7 @@ import numpy as np
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.text import dotted, listed
+from ros2_memory.core.text import leaves, listed
 from ros2_memory.counts.numbers import GREATEST, LEAST, PieceNumbers, TooManyError
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View, days_back, open_view
@@ -85,16 +85,14 @@ def _newest_of_type(view: View, topic: str, type_name: str) -> StoredMessage | N
 
 def fields_of(value: JsonValue, path: str = "") -> Iterator[tuple[str, str]]:
     """Yields dot-paths and the kinds of their values; a list has its first element's fields."""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from fields_of(inner, dotted(path, name))
-    elif isinstance(value, list):
-        if value and isinstance(value[0], dict | list):
-            yield from fields_of(value[0], path)
+    for field, inner in leaves(value, path):
+        if not isinstance(inner, list):
+            if inner != {}:
+                yield field, _kind(inner)
+        elif inner and isinstance(inner[0], dict | list):
+            yield from fields_of(inner[0], field)
         else:
-            yield path, f"list of {_kind(value[0])}s" if value else "list"
-    else:
-        yield path, _kind(value)
+            yield field, f"list of {_kind(inner[0])}s" if inner else "list"
 
 
 def _kind(value: JsonValue) -> str:

@@ -39,12 +39,12 @@ from ros2_memory.core.reply import (
     texts,
     unit,
 )
-from ros2_memory.core.text import dotted, named, quote
+from ros2_memory.core.text import leaves, named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
 
@@ -188,18 +188,9 @@ class TopicRange(AnswerWithNotes):
 
     def _cells(self) -> list[JsonObject]:
         return [
-            dict(_parts("", sample.value) if isinstance(sample.value, dict) else ())
+            dict(leaves(sample.value) if isinstance(sample.value, dict) else ())
             for sample in self.samples
         ]
-
-
-def _parts(path: str, value: JsonValue) -> Iterator[tuple[str, JsonValue]]:
-    """Yields the innermost parts of a value, by their dot-paths."""
-    if not isinstance(value, dict) or not value:
-        yield path, value
-        return
-    for name, part in value.items():
-        yield from _parts(dotted(path, name), part)
 
 
 @result("type", "topics", PAIRS("fields"))
