@@ -98,6 +98,7 @@ EVENT: Final = keys(
     _TIME("t", "start"),
     "text",
     _TIME("end").if_known,
+    PLAIN("goes_on").if_any,
     _XY.spread("point").if_known,
     INSIDE("places"),
 )
@@ -120,6 +121,7 @@ _THING: Final = keys(
     PLAIN("times", "count"),
     INSIDE("inside"),
     PLAIN("moves").if_any,
+    digits(2)("score", "best").if_known,
     PLAIN("state", "still_there.state").if_known,
 )
 
