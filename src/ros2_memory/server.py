@@ -92,7 +92,13 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
             settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
         )
         # Before anything is built, so that a refusal comes at once.
-        endpoint = None if settings.server.transport == "stdio" else _http_endpoint(settings)
+        address: Address | None = None
+        tokens: Tokens = {}
+        if settings.server.transport != "stdio":
+            from ros2_memory.serving.auth import take_tokens
+
+            address = resolve(settings.server.host, settings.server.port)
+            tokens = take_tokens(os.environ, settings.fleet.tokens, address)
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
         fleet = build_fleet(settings)
@@ -104,45 +110,18 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
     gc.freeze()
     gc.enable()
     try:
-        if endpoint is None:
+        if address is None:
             import anyio
 
             anyio.run(_serve_stdio, parts)
         else:
-            _serve_http(endpoint, parts, telemetry, page)
+            _serve_http(address, tokens, parts, telemetry, page)
     except SystemExit:
         log.info("stopped")
     finally:
         parts.server.dispatcher.stop()
         parts.health.stop()
         telemetry.stop()
-
-
-class _HttpEndpoint(NamedTuple):
-    """Where a server listens, and the tokens of its clients.
-
-    Attributes:
-        address: where it listens.
-        tokens: of its clients; none if none is needed.
-    """
-
-    address: Address
-    tokens: Tokens
-
-
-def _http_endpoint(settings: Settings) -> _HttpEndpoint:
-    """Returns the endpoint of the settings, and takes the API token out of the environment.
-
-    Raises:
-        CannotListenError: the host has no address.
-        ConfigError: a token is missing, or cannot be used.
-    """
-    from ros2_memory.serving.auth import take_tokens
-
-    host = settings.server.host
-    address = resolve(host, settings.server.port)
-    files, is_local = settings.fleet.tokens, address.is_loopback
-    return _HttpEndpoint(address, take_tokens(os.environ, files, host=host, loopback=is_local))
 
 
 def _log_start(settings: Settings, fleet: Fleet | None) -> None:
@@ -163,7 +142,7 @@ def _log_start(settings: Settings, fleet: Fleet | None) -> None:
 
 
 def _serve_http(
-    endpoint: _HttpEndpoint, parts: _Parts, telemetry: Telemetry, page: str | None
+    address: Address, tokens: Tokens, parts: _Parts, telemetry: Telemetry, page: str | None
 ) -> None:
     """Serves over HTTP until a signal comes.
 
@@ -175,15 +154,15 @@ def _serve_http(
 
     app = web_app(
         parts.server,
-        host=endpoint.address.host,
+        host=address.host,
         health=parts.health,
         background=parts.background,
-        tokens=endpoint.tokens,
+        tokens=tokens,
         metrics=telemetry.metrics,
         page=parts.page,
     )
     show_page = None if page is None or parts.page is None else partial(_show_page, page)
-    serve_http(app, endpoint.address, parts.server.dispatcher, show_page)
+    serve_http(app, address, parts.server.dispatcher, show_page)
 
 
 def _show_page(how: str, site: str) -> None:

@@ -87,16 +87,15 @@ def ask(
     if tool is not None and tool_help:
         _print_help(tool)
         return False
-    question, looking = list[str](), list[str]()
-    for word in [tool, *(given or ())]:
-        if word is None:
-            continue
-        # Where a folder has the name of a tool, the first word is the tool.
-        is_bags = is_folder(word) and not (word == tool and word in complete(word))
-        if is_bags or _SETTING.fullmatch(word):
-            looking.append(word)
-        else:
-            question.append(word)
+    words = [*filter(None, [tool]), *(given or ())]
+    # Where a folder has the name of a tool, the first word is the tool.
+    is_tool = tool in complete(tool or "")
+    looking = [
+        word
+        for word in words
+        if _SETTING.fullmatch(word) or (is_folder(word) and not (is_tool and word == tool))
+    ]
+    question = [word for word in words if word not in looking]
     loaded = load_to_look(bag_dir, looking, recording)
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, allows_fleet=True)

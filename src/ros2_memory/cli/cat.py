@@ -64,12 +64,8 @@ def cat(
     view = View(memory, Call())
     name = resolve_topic(view, topic)
     window = times.window(memory)
-    messages: Iterator[StoredMessage]
-    if tail is None:
-        messages = islice(view.stream.messages([name], window), limit)
-    else:
-        newest = islice(view.stream.messages([name], window, newest_first=True), tail)
-        messages = reversed([*newest])
+    found = view.stream.messages([name], window, newest_first=tail is not None)
+    messages = islice(found, limit) if tail is None else reversed([*islice(found, tail)])
     rows = extract_values(view, messages, field or (), exact=as_csv or as_json)
     if as_csv:
         lines = _csv_lines(rows)

@@ -173,16 +173,10 @@ def settings_to_look(
         raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
     if paths:
         path = Path(paths[0])
-        if not path.exists():
-            raise InvalidArgumentsError(
-                f"{path}: there is no such file or folder; name a bag or a folder of bags, or "
-                "write a setting as key=value"
-            )
+        folder, recording = _folder_of(path, recording)
         if bag_dir is not None:
             raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
-        bag_dir = path
-        if path.is_file():
-            bag_dir, recording = _folder_of(path, recording)
+        bag_dir = folder
     if bag_dir is not None and not _is_recorded_now(bag_dir):
         is_chosen = is_deployment_chosen(settings)
         if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in settings):
@@ -219,16 +213,27 @@ def _exists(word: str) -> bool:
         return False
 
 
-def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
-    """Returns the folder of a file, and the recording to read: a bag, or all for metadata.yaml."""
-    if file.name == METADATA_FILE:
-        return file.parent, recording
-    if bag_kind(file.name) is None:
+def _folder_of(path: Path, recording: str | None) -> tuple[Path, str | None]:
+    """Returns the folder that a path names, and which recording to read: of a bag itself alone.
+
+    Raises:
+        InvalidArgumentsError: it does not exist, or is a file and no bag.
+    """
+    if not path.exists():
+        raise InvalidArgumentsError(
+            f"{path}: there is no such file or folder; name a bag or a folder of bags, or "
+            "write a setting as key=value"
+        )
+    if not path.is_file():
+        return path, recording
+    if path.name == METADATA_FILE:
+        return path.parent, recording
+    if bag_kind(path.name) is None:
         kinds = ", ".join(BAG_KINDS)
-        raise InvalidArgumentsError(f"{file} is not a bag: their names end in {kinds}")
+        raise InvalidArgumentsError(f"{path} is not a bag: their names end in {kinds}")
     if recording is not None:
-        raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
-    real = file.resolve()
+        raise InvalidArgumentsError(f"--recording is for a folder, and {path} is one bag")
+    real = path.resolve()
     return real.parent, real.name
 
 

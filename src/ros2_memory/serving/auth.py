@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp, Receive, Scope, Send
 
+    from ros2_memory.serving.listen import Address
+
 HEALTH_PATH: Final = "/health"
 MCP_PATH: Final = "/mcp"
 RECORDING_PATH: Final = "/health/recording"
@@ -302,29 +304,28 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
 
 
 def take_tokens(
-    env: MutableMapping[str, str], files: Mapping[Path, Sequence[str]], *, host: str, loopback: bool
+    env: MutableMapping[str, str], files: Mapping[Path, Sequence[str]], address: Address
 ) -> Tokens:
-    """Returns the tokens of a server.
+    """Returns the tokens of a server; on a loopback address it needs none.
 
     Removes the API token from the environment of child processes.
 
     Args:
         env: the environment, which names the API token.
         files: the files of limited tokens, each with the robots that its token is for.
-        host: the address that the server listens on.
-        loopback: whether only this machine can reach it, so that no token is needed.
+        address: where the server listens.
 
     Raises:
         ConfigError: a token is missing, cannot be read or used, or is given twice.
     """
     token = api_token(env)
     env.pop(VARIABLE, None)
-    if token is None and not loopback and not files:
+    if token is None and not files and not address.is_loopback:
         raise ConfigError(
-            f"{VARIABLE}: missing; server.host is {host!r}, which other machines can reach, so "
-            f"clients must send a token: {_HOW} and give it as {VARIABLE}, in a file that "
-            f"{FILE_VARIABLE} names, or by LoadCredential={CREDENTIAL}:PATH in a systemd unit; "
-            "or listen on 127.0.0.1, where none is needed"
+            f"{VARIABLE}: missing; server.host is {address.host!r}, which other machines can "
+            f"reach, so clients must send a token: {_HOW} and give it as {VARIABLE}, in a file "
+            f"that {FILE_VARIABLE} names, or by LoadCredential={CREDENTIAL}:PATH in a systemd "
+            "unit; or listen on 127.0.0.1, where none is needed"
         )
     tokens: dict[str, frozenset[str] | None] = {}
     if token is not None:

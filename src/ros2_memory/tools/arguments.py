@@ -77,10 +77,8 @@ _DATE: Final = "give the date, too: now_local of data_time_range has today's"
 
 def _as_list(value: object) -> object:
     """Returns a list, which planners also send as JSON text or as one bare text."""
-    if not isinstance(value, str):
-        return value
-    parsed = _parse_json(value)
-    return parsed if isinstance(parsed, list) else [value]
+    value = _parsed(value, list)
+    return [value] if isinstance(value, str) else value
 
 
 def _as_names(value: object) -> object:
@@ -138,28 +136,31 @@ def _as_times(value: object) -> object:
     return value
 
 
-def _parse_json(text: str) -> object:
-    """Returns the value of a JSON text; None if it is invalid or longer than any argument."""
-    if len(text) > MOST_FIELDS * LONGEST_NAME:
-        return None
+def _parsed(value: object, *kinds: type) -> object:
+    """Returns the value of a JSON text, if it is of these kinds; anything else as it is.
+
+    Nothing is parsed that is longer than any argument.
+    """
+    if not isinstance(value, str) or len(value) > MOST_FIELDS * LONGEST_NAME:
+        return value
     try:
-        return json.loads(text)
+        parsed: object = json.loads(value)
     except (ValueError, RecursionError):
-        return None
+        return value
+    return parsed if isinstance(parsed, kinds) else value
 
 
 def as_region(value: object) -> object:
     """Returns a region, or several, which planners also send as JSON text."""
-    if not isinstance(value, str):
-        return value
-    parsed = _parse_json(_check_text(value, LONGEST_VALUE))
-    return parsed if isinstance(parsed, dict | list) else value
+    if isinstance(value, str):
+        return _parsed(_check_text(value, LONGEST_VALUE), dict, list)
+    return value
 
 
 def as_while(value: object) -> tuple[Sought, ...]:
     """Returns the conditions on other topics, which planners also send as JSON text."""
-    parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
-    conditions = parsed if isinstance(parsed, list) else [parsed]
+    value = as_region(value)
+    conditions = value if isinstance(value, list) else [value]
     if not conditions:
         raise ValueError("is an empty list: leave it out, or give a condition")
     if len(conditions) > MOST_CONDITIONS:
@@ -184,7 +185,7 @@ def _while_condition(parsed: object) -> Sought:
 
 def _as_hours(value: object) -> object:
     """Returns two local times of day, which planners also send as a list, or as JSON text."""
-    parsed = _parse_json(value) if isinstance(value, str) else value
+    parsed = _parsed(value, list)
     return hours_from_text("-".join(map(str, parsed if isinstance(parsed, list) else [value])))
 
 
@@ -228,14 +229,13 @@ def _check_most(most: float, seconds: float) -> float:
     return seconds
 
 
-def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> JsonValue:
+def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> object:
     if value is None:
         raise ValueError("is null")
     if isinstance(value, str):
         # Planners tend to send an object as JSON text.
         is_point = info.data.get("condition_type") == "near_position"
-        parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if is_point else None
-        return parsed if isinstance(parsed, dict) else value
+        return _parsed(_check_text(value, LONGEST_VALUE), dict) if is_point else value
     for part in (value, *(value.values() if isinstance(value, dict) else ())):
         if isinstance(part, float) and not math.isfinite(part):
             raise ValueError("is not a finite number")

@@ -237,15 +237,15 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
 
 def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_not() -> None:
     for none in ({}, {"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}):
-        assert take_tokens(none, {}, host="127.0.0.1", loopback=True) == {}
+        assert take_tokens(none, {}, resolve("127.0.0.1", 0)) == {}
     env = {"MEMORY_API_TOKEN": GOOD, "PATH": "/bin"}
-    assert take_tokens(env, {}, host="127.0.0.1", loopback=True) == {GOOD: None}
+    assert take_tokens(env, {}, resolve("127.0.0.1", 0)) == {GOOD: None}
     assert env == {"PATH": "/bin"}
     assert "MEMORY_API_TOKEN" not in without_ours({"MEMORY_API_TOKEN": GOOD})
 
 
 def taken(env: dict[str, str], files: dict[Path, list[str]]) -> Tokens:
-    return take_tokens(env, files, host="10.0.0.1", loopback=False)
+    return take_tokens(env, files, resolve("10.0.0.1", 0))
 
 
 def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) -> None:
