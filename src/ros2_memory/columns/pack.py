@@ -104,16 +104,16 @@ class Packed:
     Attributes:
         codec: how `data` is read.
         count: how many values there are.
-        error: the greatest absolute error of an unpacked value, as measured; 0.0 if all are exact.
         zone: of the values before they were rounded.
+        error: the greatest absolute error of an unpacked value, as measured; 0.0 if all are exact.
         data: the bytes, not compressed yet; empty if every value is the zone's least.
     """
 
     codec: str
     count: int
-    error: float
     zone: Zone
-    data: bytes
+    error: float = 0.0
+    data: bytes = b""
 
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
@@ -121,7 +121,7 @@ def pack(column: Column, step: Step = EXACT) -> Packed:
     if isinstance(column, Texts):
         return _pack_texts(column)
     if not len(column):
-        return Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
+        return Packed(f"{column.dtype.name} constant", 0, Zone())
     return _pack_floats(column, step) if column.dtype.kind == "f" else _pack_integers(column)
 
 
@@ -199,7 +199,7 @@ def _pack_integers(column: Numbers) -> Packed:
     name, least, greatest = column.dtype.name, int(column.min()), int(column.max())
     zone = Zone(least, greatest)
     if least == greatest:
-        return Packed(f"{name} constant", len(column), 0.0, zone, b"")
+        return Packed(f"{name} constant", len(column), zone)
     # Unsigned ones of 2**63 and more wrap around, here and back.
     numbers = column.reshape(-1).astype(np.int64) - _wrapped(least)
     return _arrange(f"{name} whole", numbers, zone)
@@ -214,7 +214,7 @@ def _pack_floats(column: Numbers, step: Step) -> Packed:
     values = column.astype(np.float64, copy=False)
     zone = _zone_of(values)
     if zone.least == zone.greatest and zone.nulls in {0, len(column)}:
-        return Packed(f"{column.dtype.name} constant", len(column), 0.0, zone, b"")
+        return Packed(f"{column.dtype.name} constant", len(column), zone)
     most, limit = max(abs(zone.low), abs(zone.high)), _MOST_MULTIPLES[column.itemsize]
     if zone.nulls or not math.isfinite(most):
         return _exactly(column, zone)
@@ -325,7 +325,7 @@ def _arrange(
     greatest = int(written.view(np.uint64).max(initial=0))
     width = (greatest.bit_length() + 7) // 8
     data = head + byte_planes(written, width)
-    return Packed(f"{form} {name} {width}", len(flat), error, zone, data)
+    return Packed(f"{form} {name} {width}", len(flat), zone, error, data)
 
 
 def _bits_of(numbers: Numbers) -> float:
@@ -399,12 +399,12 @@ def _pack_texts(column: Texts) -> Packed:
     codes, words = column.codes, column.words
     zone = Zone(words=zone_words(words))
     if not words:
-        return Packed("text constant", 0, 0.0, zone, b"")
+        return Packed("text constant", 0, zone)
     lengths = np.array([len(word) for word in words], "<u4")
     text = "".join(words).encode("utf-8", "surrogatepass")
     head = struct.pack("<II", len(words), len(text)) + lengths.tobytes() + text
     if len(words) == 1:
-        return Packed("text constant", len(codes), 0.0, zone, head)
+        return Packed("text constant", len(codes), zone, data=head)
     return _arrange("text", codes.astype(np.int64), zone, head=head)
 
 

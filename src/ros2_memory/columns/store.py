@@ -397,7 +397,7 @@ class ColumnStore(Database):
                 (topic - self.offset, path, parts.start - self.offset, parts.stop - self.offset),
             )
             return {
-                part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
+                part + self.offset: Packed(intern(codec), count, zone_of(*zone), error)
                 for part, codec, count, error, *zone in rows
             }
 

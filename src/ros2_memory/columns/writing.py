@@ -14,7 +14,6 @@ import json
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -76,41 +75,8 @@ UNUSED_SUMMARIES: Final = "DELETE FROM summary WHERE id NOT IN (SELECT summary F
 _NEVER_DROPPED: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
 
 
-@dataclass(frozen=True)
-class PackedPart:
-    """A part as it is stored.
-
-    Attributes:
-        first: the earliest log time (ns), inclusive.
-        last: the latest, inclusive.
-        messages: how many rows.
-        bags: the numbers of the bags that its rows are of, ascending.
-        columns: packed, by their paths; the data is compressed.
-    """
-
-    first: Ns
-    last: Ns
-    messages: int
-    bags: tuple[int, ...]
-    columns: Mapping[str, Packed]
-
-    @cached_property
-    def path_of_data(self) -> dict[bytes, str]:
-        """The path of the first column with some data: equal data is stored once."""
-        path_of: dict[bytes, str] = {}
-        for path, packed in self.columns.items():
-            if packed.data:
-                path_of.setdefault(packed.data, path)
-        return path_of
-
-    @property
-    def size(self) -> int:
-        """How many bytes its data takes."""
-        return sum(map(len, self.path_of_data))
-
-
-def pack_rows(table: Table, bags: IntArray) -> PackedPart:
-    """Returns the rows of a table as a part.
+def _packed_columns(table: Table, bags: IntArray) -> dict[str, Packed]:
+    """Returns the columns of a part by their paths; their data is compressed.
 
     Args:
         table: the rows.
@@ -124,14 +90,13 @@ def pack_rows(table: Table, bags: IntArray) -> PackedPart:
         # A table without columns may have log times in place of publish times.
         if is_hashed.all() or "" not in table.left_out:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
-            packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
+            packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), published)
     for path, column in columns_in(table):
         packed[path] = pack(column, step_of(path, table.definition))
     for path, whole in packed.items():
         if whole.data:
             packed[path] = replace(whole, data=compress(whole.data))
-    first, last = int(table.log_times[0]), int(table.log_times[-1])
-    return PackedPart(first, last, len(table), tuple(np.unique(bags).tolist()), packed)
+    return packed
 
 
 class ReadBag(NamedTuple):
@@ -222,8 +187,8 @@ class Writing:
                 topic = _topic_of(connection, table)
                 rows = table if is_new.all() else table.rows(np.flatnonzero(is_new))
                 for piece in _pieces_of(rows, by_hour=self.budget is not None):
-                    part = pack_rows(piece, ids[piece.bag_numbers])
-                    parts.append(_insert_part(connection, topic, part, self.level))
+                    bags = ids[piece.bag_numbers]
+                    parts.append(_insert_part(connection, topic, piece, bags, self.level))
         if self.budget is not None:
             messages = sum(_messages_of(bag.bag) for bag in self.bags)
             share = round(self.budget / max(messages, 1) * sum(map(len, tables)))
@@ -371,20 +336,35 @@ def _insert_bag(connection: sqlite3.Connection, to_store: ReadBag) -> int:
     )
 
 
-def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, level: Level) -> int:
+def _insert_part(
+    connection: sqlite3.Connection, topic: int, table: Table, bags: IntArray, level: Level
+) -> int:
+    """Inserts the rows of a table as a part; returns its id.
+
+    Args:
+        connection: to the store.
+        topic: the id of the topic.
+        table: the rows.
+        bags: the id of each row's bag.
+        level: of the part.
+    """
+    columns = _packed_columns(table, bags)
+    path_of: dict[bytes, str] = {}  # equal data is stored once
+    for path, packed in columns.items():
+        path_of.setdefault(packed.data, path)
     number = _insert(
         connection,
         "part",
         topic=topic,
-        first_ns=part.first,
-        last_ns=part.last,
-        messages=part.messages,
-        bags=json.dumps(part.bags),
+        first_ns=int(table.log_times[0]),
+        last_ns=int(table.log_times[-1]),
+        messages=len(table),
+        bags=json.dumps(np.unique(bags).tolist()),
         dropped="",
-        bytes=part.size,
+        bytes=sum(map(len, path_of)),
         level=level,
     )
-    for path, packed in part.columns.items():
+    for path, packed in columns.items():
         least, greatest, nulls, words = packed.zone
         zone = (_bound(least), _bound(greatest), nulls, words)
         connection.execute(
@@ -394,7 +374,7 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart, l
         )
         # Numbers that are all rounded to one take no bytes, but are no constant.
         if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
-            first = part.path_of_data.get(packed.data, path)
+            first = path_of[packed.data] if packed.data else path
             same, data = (None, packed.data) if first == path else (first, None)
             connection.execute(
                 "INSERT INTO part_column (part, path, same, data) VALUES (?, ?, ?, ?)",
