@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.arrays import concatenated, places_among
+from ros2_memory.core.arrays import concatenated, places_among, stable_order
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.bag_rows import Bags
 
@@ -61,8 +61,7 @@ class Coverage:
         self.state = state
         self.segments = tuple(segments)
         all_numbers = concatenated(covered.numbers for covered in segments)
-        order = np.argsort(all_numbers, kind="stable")
-        self._of_parts: dict[int, IntArray] = {}
+        order = stable_order(all_numbers)
         self._bags = Bags(covered.segment.bags for covered in segments)
         self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
         self._numbers: IntArray = all_numbers[self._order]
@@ -111,17 +110,9 @@ class Coverage:
         """Returns for each number whether the timeline has its bag."""
         return places_among(numbers, self._numbers)[1]
 
-    def of_part(self, part: int, numbers: IntArray) -> IntArray:
-        """Returns the bags of a part that the timeline has.
-
-        Args:
-            part: the number of the part.
-            numbers: the numbers of its bags.
-        """
-        if part not in self._of_parts:
-            has_bags = self._has_bags(numbers)
-            self._of_parts[part] = numbers if has_bags.all() else numbers[has_bags]
-        return self._of_parts[part]
+    def known(self, numbers: IntArray) -> IntArray:
+        """Returns those of some bags that the timeline has, by their numbers."""
+        return numbers[self._has_bags(numbers)]
 
     def counts(self, groups: Sequence[IntArray]) -> IntArray:
         """Returns how many bags of each group the timeline has; no group may be empty."""

@@ -32,7 +32,13 @@ from ros2_memory.columns.values import (
     unknown,
     zones_of,
 )
-from ros2_memory.core.arrays import Floats, entries_of_codes, places_among
+from ros2_memory.core.arrays import (
+    Floats,
+    entries_of_codes,
+    places_among,
+    range_numbers,
+    stable_order,
+)
 from ros2_memory.core.text import LISTS_OF_LABELS, looks_like_json
 from ros2_memory.messages.detections import (
     MAX_DEPTH,
@@ -47,6 +53,7 @@ from ros2_memory.messages.detections import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import IntArray, Mask
@@ -73,35 +80,6 @@ class NamedScores(NamedTuple):
     def at(self, positions: IntArray) -> NamedScores:
         """Returns the names and scores of the objects at some positions."""
         return NamedScores(self.name.at(positions), self.score[positions], self.error)
-
-
-class Scored(NamedTuple):
-    """Where the name and the score of objects are that may be detections.
-
-    Attributes:
-        level: where the objects lie.
-        labels: texts, then whole numbers: the first that is not blank is the name.
-        scores: numbers: the first that is not NaN is the score.
-    """
-
-    level: Level
-    labels: tuple[Leaf, ...]
-    scores: tuple[Leaf, ...]
-
-    def read(self, values: Values) -> NamedScores:
-        """Returns the name and score of each object.
-
-        Raises:
-            UnknownShapeError: the table has no column for one of them.
-        """
-        name = _names(values, self.labels[0])
-        for leaf in self.labels[1:]:
-            name = _texts_or(name, _names(values, leaf), replace_blank=True)
-        score, error = np.full(len(name), np.nan), 0.0
-        for leaf in self.scores:
-            column, leaf_error = values.floats(leaf)
-            score, error = np.where(np.isnan(score), column, score), max(error, leaf_error)
-        return NamedScores(name, score, error)
 
 
 def _names(values: Values, leaf: Leaf) -> Texts:
@@ -140,46 +118,64 @@ class Labels(NamedTuple):
     """Objects that may be detections.
 
     Attributes:
-        scored: their names and scores; with `is_best` those of their hypotheses.
+        level: where names and scores are: in the objects; with `is_best` in their hypotheses.
+        names: texts, then whole numbers: the first that is not blank is the name.
+        scores: numbers: the first that is not NaN is the score.
         inner: where detections may be inside an object that has no name.
         frames: texts that may name the frame, the outermost first.
         points: where their place may be, the first choice first; None if it depends on the message.
         is_best: whether the best of several hypotheses names an object.
     """
 
-    scored: Scored
+    level: Level
+    names: tuple[Leaf, ...]
+    scores: tuple[Leaf, ...]
     inner: tuple[Source, ...]
     frames: tuple[Leaf, ...]
     points: tuple[Point, ...] | None
-    is_best: bool = False
+    is_best: bool
 
     @property
     def leaf(self) -> Leaf:
         """The first choice for the name."""
-        return self.scored.labels[0]
+        return self.names[0]
 
     @property
-    def level(self) -> Level:
+    def level_of_objects(self) -> Level:
         """Where the objects lie."""
-        level = self.scored.level
-        return level.parent if self.is_best and level.parent else level
+        return self.level.parent if self.is_best and self.level.parent else self.level
+
+    def read_all(self, values: Values) -> NamedScores:
+        """Returns the name and score of each object or hypothesis.
+
+        Raises:
+            UnknownShapeError: the table has no column for one of them.
+        """
+        name = _names(values, self.names[0])
+        for leaf in self.names[1:]:
+            name = _texts_or(name, _names(values, leaf), replace_blank=True)
+        score, error = np.full(len(name), np.nan), 0.0
+        for leaf in self.scores:
+            column, leaf_error = values.floats(leaf)
+            score, error = np.where(np.isnan(score), column, score), max(error, leaf_error)
+        return NamedScores(name, score, error)
 
     def read(self, values: Values) -> tuple[IntArray, NamedScores]:
-        """Returns the name and score of each object, behind their positions in `scored.level`.
+        """Returns the name and score of each object, behind their positions in `level`.
 
         Raises:
             UnknownShapeError: the table has no column for one of them, or scores were rounded so
                 that another hypothesis may be the best.
         """
-        named = self.scored.read(values)
+        named = self.read_all(values)
         if not self.is_best:
             return np.arange(len(named.name)), named
-        best = _best_hypotheses(named, values.elements(self.scored.level).owners)
+        best = _best_hypotheses(named, values.elements(self.level).owners)
         return best, named.at(best)
 
     def objects(self, values: Values, positions: IntArray) -> IntArray:
-        """Returns the objects that are named at some positions in `scored.level`."""
-        return values.elements(self.scored.level).owners[positions] if self.is_best else positions
+        """Returns the objects that are named at some positions in `level`."""
+        return values.elements(self.level).owners[positions] if self.is_best else positions
 
     def not_below(self, values: Values, least: float) -> TruthValues:
         """Returns which objects are no detection with a score below `least`.
@@ -189,7 +185,7 @@ class Labels(NamedTuple):
         """
         positions, named = self.read(values)
         owners = self.objects(values, positions)
-        surely, perhaps = unknown(values.size(self.level))
+        surely, perhaps = unknown(values.size(self.level_of_objects))
         surely[owners] = named.is_named & ~(named.score < least + named.error)
         perhaps[owners] = ~(named.is_named & (named.score < least - named.error))
         return TruthValues(surely, perhaps)
@@ -229,14 +225,12 @@ class Json(NamedTuple):
     """A text that may be JSON with detections.
 
     Attributes:
-        leaf: the text.
-        depth: how many lists, objects and texts deep detections are looked for in it.
+        leaf: the text, with the depth to which detections are looked for in it.
         frames: texts that may name the frame, the outermost first.
         is_beside: whether the message has other content beside it.
     """
 
     leaf: Leaf
-    depth: int
     frames: tuple[Leaf, ...]
     is_beside: bool = False
 
@@ -291,7 +285,8 @@ def _walk(node: Node, depth: int, frames: tuple[Leaf, ...], least: float | None)
     if depth == 0:
         return _Walked(node)
     if isinstance(node, Leaf) and node.kind is Kind.TEXT:
-        return _Walked(node._replace(json_depth=depth), (Json(node, depth, frames),))
+        text = node._replace(json_depth=depth)
+        return _Walked(text, (Json(text, frames),))
     if isinstance(node, Listing) and isinstance(node.element, dict):
         walked = _walk(node.element, depth - 1, frames, least)
         return _Walked(Listing(node.level, walked.node), walked.sources)
@@ -321,19 +316,18 @@ def _labels(
     fields: dict[str, Node], inner: tuple[Source, ...], frames: tuple[Leaf, ...]
 ) -> Labels | None:
     """Returns how an object with these fields may be a detection; None if it never is."""
-    scored, results = _scored(fields), fields.get("results")
-    if scored is not None:
-        return Labels(scored, inner, frames, _points(fields))
-    if not isinstance(results, Listing) or not isinstance(results.element, dict):
+    named, points, is_best = fields, _points(fields), False
+    results = fields.get("results")
+    element = results.element if isinstance(results, Listing) else None
+    if isinstance(element, dict) and not _naming_leaves(fields):
+        # The hypotheses of a detection (vision_msgs).
+        is_best, hypothesis, of_best = True, element.get("hypothesis"), _points(element)
+        named = hypothesis if isinstance(hypothesis, dict) else element
+        points = None if of_best is None or points is None else of_best + points
+    names, scores = _naming_leaves(named), _leaves(named, SCORES, Kind.INTEGER, Kind.REAL)
+    if not names:
         return None
-    # The hypotheses of a detection (vision_msgs).
-    hypothesis = results.element.get("hypothesis")
-    scored = _scored(hypothesis if isinstance(hypothesis, dict) else results.element)
-    if scored is None:
-        return None
-    of_best, own = _points(results.element), _points(fields)
-    points = None if of_best is None or own is None else of_best + own
-    return Labels(scored, inner, frames, points, is_best=True)
+    return Labels(names[0].level, names, scores, inner, frames, points, is_best)
 
 
 def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> Node:
@@ -344,26 +338,24 @@ def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> 
         return TruthValues(surely[positions], perhaps[positions])
 
     def find_hypotheses(values: Values, positions: IntArray) -> TruthValues:
-        named, owners = labels.scored.read(values), labels.objects(values, positions)
+        named, owners = labels.read_all(values), labels.objects(values, positions)
         score = named.score[positions]
         surely, perhaps = ~(score < least + named.error), ~(score < least - named.error)
         # Where it is not sure that the detection is one, neither is what stays of it.
         is_detection = limit.truth(values, owners).surely
         return TruthValues(surely & is_detection, perhaps | ~is_detection)
 
-    limit = Limit(labels.level, find_objects)
+    limit = Limit(labels.level_of_objects, find_objects)
     if labels.is_best:
-        results = with_limit(node["results"], Limit(labels.scored.level, find_hypotheses))
+        results = with_limit(node["results"], Limit(labels.level, find_hypotheses))
         node = {**node, "results": results}
     return with_limit(node, limit)
 
 
-def _scored(fields: Mapping[str, Node]) -> Scored | None:
-    """Returns where an object with these fields has its name and score; None if it has no name."""
+def _naming_leaves(fields: Mapping[str, Node]) -> tuple[Leaf, ...]:
+    """Returns the fields that name an object: texts, then whole numbers."""
     names = tuple(naming_fields(fields.keys()))
-    labels = _leaves(fields, names, Kind.TEXT) + _leaves(fields, names, Kind.INTEGER)
-    scores = _leaves(fields, SCORES, Kind.INTEGER, Kind.REAL)
-    return Scored(labels[0].level, labels, scores) if labels else None
+    return _leaves(fields, names, Kind.TEXT) + _leaves(fields, names, Kind.INTEGER)
 
 
 def _leaves(fields: Mapping[str, Node], names: tuple[str, ...], *kinds: Kind) -> tuple[Leaf, ...]:
@@ -416,17 +408,16 @@ def _position_at(
 
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
     """Returns whether one of these texts looks like JSON, or has no column."""
-    return any(_leaf_may_be_json(values, leaf) for leaf in texts)
-
-
-def _leaf_may_be_json(values: Values, leaf: Leaf) -> bool:
-    zones = values.zones(leaf)
-    if zones is not None and not zones.may_be_json:
-        return False
-    try:
-        return any(map(looks_like_json, values.texts(leaf).words))
-    except UnknownShapeError:
-        return True
+    for leaf in texts:
+        zones = values.zones(leaf)
+        if zones is not None and not zones.may_be_json:
+            continue
+        try:
+            if any(map(looks_like_json, values.texts(leaf).words)):
+                return True
+        except UnknownShapeError:
+            return True
+    return False
 
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
@@ -540,7 +531,7 @@ class DetectionColumns:
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns which parts may have a detection, by their zones; True if all may."""
-        texts = self._only_texts(parts)
+        texts = self._only_texts(parts.topic)
         if texts is None:
             return True
         possible: bool | Mask = False
@@ -554,9 +545,9 @@ class DetectionColumns:
         texts = self._only_texts(table)
         return texts is None or may_be_json(Values(table), texts)
 
-    def _only_texts(self, table_or_parts: Table | PartZones) -> list[Leaf] | None:
+    def _only_texts(self, rows: Table | Topic) -> list[Leaf] | None:
         """Returns the texts that may be JSON; None if a type has detections elsewhere, too."""
-        plan = self._plans.of(table_or_parts)
+        plan = self._plans.of(rows)
         if plan is None:
             return None
         texts = [source.leaf for source in plan.sources if isinstance(source, Json)]
@@ -587,7 +578,7 @@ def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
     detections = [detection for of_message in by_message for detection in of_message]
     nowhere = (math.nan, math.nan, math.nan)
     return Detections(
-        np.repeat(np.arange(len(by_message)), [*map(len, by_message)]),
+        range_numbers([*map(len, by_message)]),
         Texts.of([detection.label for detection in detections]),
         np.array([detection.score for detection in detections], np.float64),  # of None: NaN
         np.array([detection.place or nowhere for detection in detections]).reshape(-1, 3),
@@ -602,7 +593,7 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
     if not parts:
         return detections_by(())
     rows = np.concatenate([part.rows for part in parts])
-    order = np.argsort(rows, kind="stable")
+    order = stable_order(rows)
     return Detections(
         rows[order],
         joined_texts([part.labels for part in parts]).rows(order),
@@ -643,12 +634,12 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     """Returns the objects that have a name, with their scores; raises as `detections_in`."""
     positions, named = source.read(values)
     is_named = np.flatnonzero(named.is_named)
-    if is_named.size < values.size(source.level):
+    if is_named.size < values.size(source.level_of_objects):
         inside = chain(*(detections_in(values, inner, places=False) for inner in source.inner))
         if any(detections.rows.size for detections in inside):
             raise UnknownShapeError("some objects are detections, others have some inside")
     positions = positions[is_named]
-    detections = _detections_at(values, source.scored.level, positions, named.at(is_named))
+    detections = _detections_at(values, source.level, positions, named.at(is_named))
     return _with_places(values, source, positions, detections) if places else detections
 
 
@@ -673,21 +664,18 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     """Yields the detections in texts that are JSON; each distinct text is parsed once."""
     if not may_be_json(values, [source.leaf]):
         return
-    texts = values.texts(source.leaf)
+    texts, depth = values.texts(source.leaf), source.leaf.json_depth
     parsed = values.table.remember(
-        f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
+        f"JSON of depth {depth} in {source.leaf.level.full(source.leaf.sources[0])}",
         lambda: detections_by(
-            [
-                detections_of(word, depth=source.depth, is_beside=source.is_beside)
-                for word in texts.words
-            ]
+            [detections_of(word, depth=depth, is_beside=source.is_beside) for word in texts.words]
         ),
         lambda detections: 1000 + 100 * detections.rows.size,
     )
     if not parsed.rows.size:
         return
     counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
-    positions = np.repeat(np.arange(len(texts)), counts)
+    positions = range_numbers(counts)
     rows = _owners_at(values, source.leaf.level, positions, ROWS)
     detections = parsed.select(nth)
     frames = _frames_at(values, source.leaf.level, positions, source.frames)
@@ -700,7 +688,7 @@ def _with_places(
     """Returns detections with their place: the first point of each that is valid."""
     if source.points is None:
         raise UnknownShapeError("points are of another shape in each message")
-    level, places = source.scored.level, detections.places
+    level, places = source.level, detections.places
     frames = _frames_at(values, level, positions, source.frames)
     for point in source.points:
         at = _owners_at(values, level, positions, point.axes[0].level)

@@ -397,7 +397,7 @@ class Scan:
     def _first_bag(self, part: PartHead) -> BagFile | None:
         """Returns the first bag whose rows in a part count, if there is one."""
         assert self._coverage is not None  # noqa: S101 - there are no parts without one
-        counting = self._coverage.of_part(part.number, part.bags)
+        counting = self._coverage.known(part.bags)
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
     def _units(self, source: _Source) -> Iterable[Unit]:

@@ -352,7 +352,7 @@ class Scanner:
         topic = self._store_of_parts.topic(head.topic)
         if topic is None:
             raise GoneError
-        counting = coverage.of_part(head.number, head.bags)
+        counting = coverage.known(head.bags)
         if not counting.size:
             return None
         table = self._table(head, topic)
@@ -391,7 +391,7 @@ class Scanner:
                 raise KeyError(path)
             return self._column(head.number, path, column)
 
-        left_out = topic.layout.left_out
+        left_out = topic.left_out
         if head.dropped:
             left_out = {**left_out, **dict.fromkeys(head.dropped, _DROPPED)}
         zeros = np.zeros(head.messages, np.int64)  # `Unit` loads the true times

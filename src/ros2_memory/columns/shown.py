@@ -38,6 +38,7 @@ from ros2_memory.columns.values import (
     where_longer,
     within_limits,
 )
+from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.text import dotted
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import (
@@ -55,7 +56,7 @@ from ros2_memory.storage.base import SEQUENCE, Definition
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.zones import PartZones
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.core.arrays import Floats
     from ros2_memory.storage.base import IntArray
 
@@ -305,11 +306,11 @@ def _shape(definition: Definition, type_name: str, extractor: SchemaExtractor) -
     return Shape(definition, type_name, extractor)
 
 
-def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
+def shape_of(rows: Table | Topic, extractor: SchemaExtractor) -> Shape | None:
     """Returns the shape of the type of a table or of parts; None if their messages decide."""
-    if table_or_parts.definition is None or "" in table_or_parts.left_out:
+    if rows.definition is None or "" in rows.left_out:
         return None
-    return _shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
+    return _shape(rows.definition, rows.channel.type, extractor)
 
 
 class ByType(Generic[T]):
@@ -325,9 +326,9 @@ class ByType(Generic[T]):
         self._make = make
         self._known: dict[Shape, T | None] = {}
 
-    def of(self, table_or_parts: Table | PartZones) -> T | None:
+    def of(self, rows: Table | Topic) -> T | None:
         """Returns what is made for the type of a table or of parts; None if messages decide."""
-        shape = shape_of(table_or_parts, self._extractor)
+        shape = shape_of(rows, self._extractor)
         if shape is None:
             return None
         if shape not in self._known:
@@ -560,7 +561,7 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     rows = np.concatenate([part.rows for part in parts])
     joined = np.concatenate([part.numbers for part in parts])
     errors = np.concatenate([part.errors for part in parts])
-    order = np.argsort(rows, kind="stable")
+    order = stable_order(rows)
     return FieldNumbers(rows[order], joined[order], errors[order])
 
 

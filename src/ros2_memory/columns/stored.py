@@ -219,6 +219,11 @@ class Topic:
         """The fields of the messages; None where they are not known."""
         return self.define(self.channel)
 
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Which fields have no column; see `Table.left_out`."""
+        return self.layout.left_out
+
 
 def lazy_columns(
     layout: Layout, column: Callable[[str], Column], dropped: Collection[str], sequence: str = ""

@@ -122,7 +122,7 @@ class ColumnCondition:
         Remembers the tests that rows of each part may pass, since `truth` would look at the zones
         of the part again, which takes as long as all this.
         """
-        plan = self._plans.of(parts)
+        plan = self._plans.of(parts.topic)
         if plan is None:
             return True
         possible: list[Mask] = []

@@ -12,13 +12,13 @@ from ros2_memory.columns.table import Zone, as_float, may_be_in
 from ros2_memory.core.arrays import places_among
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.columns.stored import Topic
     from ros2_memory.core.arrays import Flags
-    from ros2_memory.storage.base import Channel, Definition, IntArray
+    from ros2_memory.storage.base import IntArray
 
     Floats = NDArray[np.float64]
 
@@ -138,21 +138,6 @@ class PartZones(NamedTuple):
     topic: Topic
     numbers: IntArray
     zones: Callable[[str], Zones]
-
-    @property
-    def channel(self) -> Channel:
-        """The topic's channel."""
-        return self.topic.channel
-
-    @property
-    def definition(self) -> Definition | None:
-        """The fields of its type; None where they are not known."""
-        return self.topic.definition
-
-    @property
-    def left_out(self) -> Mapping[str, str]:
-        """Which fields have no column; see `Table.left_out`."""
-        return self.topic.layout.left_out
 
     def zone(self, path: str) -> Zones:
         """Returns the zones of a column; of elements its path is `<sequence>.<column>`."""
