@@ -128,12 +128,6 @@ class OpenDatabase:
     files: tuple[str, ...] = ()
     identities: tuple[tuple[int, int] | None, ...] = ()
 
-    @classmethod
-    def of_file(cls, connection: sqlite3.Connection, path: Path) -> OpenDatabase:
-        """Returns the database that was opened at a path."""
-        files = tuple(map(str, files_of(path)))
-        return cls(connection, path, files, _identities(files))
-
     def is_in_place(self) -> bool:
         """Whether the paths still lead to the open files; True if that cannot be found out."""
         try:
@@ -441,7 +435,8 @@ def open_file(
                 _copy_first_valid((previous,) if previous else (*paths[nth:], *sources), path)
             connection = _connect_and_check(path)
             connection.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
-            return OpenDatabase.of_file(connection, path)
+            files = tuple(map(str, files_of(path)))
+            return OpenDatabase(connection, path, files, _identities(files))
         except (OSError, sqlite3.Error) as error:
             if is_busy(error):
                 write_log = log.debug if again else log.warning

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.core.arrays import entries_of_codes, joined_codes, numbered
+from ros2_memory.core.arrays import entries_of_codes, joined_codes, numbered, range_numbers
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -198,7 +198,7 @@ class Elements:
         """Returns the elements of some rows, which become the rows 0, 1, 2 and so on."""
         counts, taken = entries_of_codes(self.owners, positions)
         return Elements(
-            np.repeat(np.arange(positions.size), counts),
+            range_numbers(counts),
             {path: _rows_of(column, taken) for path, column in self.columns.items()},
             {path: inner.rows(taken) for path, inner in self.elements.items()},
         )

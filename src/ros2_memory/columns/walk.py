@@ -21,7 +21,7 @@ from ros2_memory.columns.table import (
     Numbers,
     Texts,
 )
-from ros2_memory.core.arrays import gathered, places_within
+from ros2_memory.core.arrays import gathered, places_within, range_numbers
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import SEQUENCE, Batch, IntArray, Mask
 
@@ -68,8 +68,7 @@ class LevelColumns:
             counts: how many elements each row has.
             inner: the columns of the elements.
         """
-        owners = np.repeat(np.arange(counts.size), counts)
-        self.elements[path] = Elements(owners, inner.columns, inner.elements)
+        self.elements[path] = Elements(range_numbers(counts), inner.columns, inner.elements)
         for inner_path, reason in inner.left_out.items():
             self.left_out[f"{path}.{inner_path}"] = reason
 
@@ -255,7 +254,7 @@ class _Walk:
             counts = np.full(at.size, step.length, np.int64)
         if (at + counts * max(step.plan.least, 1) > rows.sizes).any():
             raise NotWalkedError
-        owners = np.repeat(np.arange(at.size), counts)
+        owners = range_numbers(counts)
         if step.plan.size is None:
             begins, end = self._locate_variable(step.plan, rows, at, counts)
         else:
@@ -316,7 +315,7 @@ def add_sequence(
     is_short = counts <= step.most
     is_of_short = np.repeat(is_short[is_ranged], counts[is_ranged])
     numbers = values if is_of_short.all() else values[is_of_short]
-    owners = np.repeat(np.arange(counts.size), np.where(is_short, counts, 0))
+    owners = range_numbers(np.where(is_short, counts, 0))
     level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
     if not is_short.all():
         level.left_out[path] = f"more than {step.most} numbers in some messages"
