@@ -13,21 +13,24 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 import numpy as np
 
 from ros2_memory.analysis.frames import is_odometry, joined_edges
+from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
+from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
+    Line,
     PathSlice,
     joined_slices,
     path_slice,
 )
 from ros2_memory.analysis.poses import (
     NO_POSES,
+    FrameCodes,
     Poses,
     joined_poses,
     placed_body,
     positions_apart,
 )
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
-from ros2_memory.columns.kinds import PATHS
 from ros2_memory.columns.poses import rounded
 from ros2_memory.columns.scan import STRETCH_NS, Stretch
 from ros2_memory.columns.steps import METRES
@@ -82,6 +85,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="Sized")
 
+_MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
+PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, FrameCodes))
+"""The path of the poses of a topic in a slice of the clock."""
 _MOST_TRIED: Final = 1000
 """How many of the newest messages are tried until one can be decoded, or places the robot."""
 _BODIES: Final = ("base_footprint", "base_link", "base", "body")

@@ -16,6 +16,7 @@ from ros2_memory.analysis.motion.standstills import (
     DROP_SLOT_NS,
     SHORTEST_NS,
     SILENCE_NS,
+    Blocks,
     SpeedDrop,
     Stands,
     Standstill,
@@ -23,7 +24,8 @@ from ros2_memory.analysis.motion.standstills import (
     standstills_of,
 )
 from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, Trajectory
-from ros2_memory.columns.kinds import STANDS
+from ros2_memory.columns.fragments import FragmentKind
+from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import without
@@ -52,11 +54,21 @@ from ros2_memory.history.robots import parallel_or_twice, require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS, with_runs
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.view import View
 
+
+def _joined_stands(parts: Sequence[Stands]) -> Sequence[Stands]:
+    drops = tuple(drop for part in parts for drop in part.drops)
+    return [
+        Stands(stacked([part.blocks for part in parts]), drops, max(part.last for part in parts))
+    ]
+
+
+STANDS: Final = FragmentKind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
+"""Where the robot may have stood in a slice of the clock, by the poses of a topic."""
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 """A standstill that begins so soon after a loss of speed is the end of braking."""
 _MOST_MISSING: Final = 0.1

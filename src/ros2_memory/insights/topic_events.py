@@ -19,15 +19,16 @@ import numpy as np
 
 from ros2_memory.analysis.facts import FLAG, GOAL, GOALS, Stated, joined_stated, state_of, stated_by
 from ros2_memory.analysis.goals import ENDED, GOAL_WORDS, STATUS, STATUS_WORDS, statuses_matching
+from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.topic_events import (
     Change,
     KnownState,
+    Report,
     TopicEvents,
     events_of,
     joined_events,
 )
-from ros2_memory.columns.fragments import FragmentKey
-from ros2_memory.columns.kinds import EVENTS
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.writing import PART_NS
@@ -57,6 +58,16 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 
+
+def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
+    whole = joined_events(parts)
+    return [] if whole.is_empty else [whole]
+
+
+EVENTS: Final = FragmentKind(
+    "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
+)
+"""What came into view, changed or failed on a topic in a part."""
 _MOST_NAMED: Final = 5
 """So many booleans that toggled in one message are named."""
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")

@@ -28,11 +28,11 @@ from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     joined_tracks,
     partial_track,
+    settled_tracks,
     track_by,
 )
 from ros2_memory.analysis.poses import Poses, headings, placed_body
-from ros2_memory.columns.fragments import FragmentKey
-from ros2_memory.columns.kinds import TRACKS
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
@@ -71,6 +71,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
+TRACKS: Final = FragmentKind("track", (PartialTrack,), settled_tracks)
+"""Where the poses of a part have the robot in a frame; joined, those of a recording."""
 _NOT_PLACED: Final = Reason(
     "has no transforms that place its poses: they are left out",
     "recording",
