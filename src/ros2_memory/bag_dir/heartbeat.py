@@ -38,6 +38,7 @@ _ENDED: Final = frozenset("ZX")
 _MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
 
 _Text: TypeAlias = Annotated[str, AfterValidator(encodable)]
+_Texts: TypeAlias = tuple[_Text, ...]
 _Pid: TypeAlias = Annotated[int, Field(strict=True, ge=1, le=MAX_NS)]
 _Interval: TypeAlias = Annotated[float, Field(strict=True, gt=0, le=MAX_INTERVAL_S)]
 
@@ -71,33 +72,33 @@ class Heartbeat:
     pid: _Pid
     updated: Int64
     state: RecorderState
-    recordings: tuple[_Text, ...]
+    recordings: _Texts
     since: Int64
     bytes_written: Count
-    subscribed: tuple[_Text, ...]
-    silent: tuple[_Text, ...]
+    subscribed: _Texts
+    silent: _Texts
     last_error: _Text | None
     interval_s: _Interval
     # Older recorders did not write these.
     restarts: Count = 0
-    missing: tuple[_Text, ...] = ()
+    missing: _Texts = ()
     age_held: _Text | None = None
     lost: dict[_Text, Count] = field(default_factory=dict)
-    cut_short: tuple[_Text, ...] = ()
+    cut_short: _Texts = ()
     waiting_for: _Text | None = None
     held_back: _Text | None = None
-    failing_rules: tuple[_Text, ...] = ()
+    failing_rules: _Texts = ()
     unshipped: _Text | None = None
-    listed: tuple[_Text, ...] = ()
+    listed: _Texts = ()
     process: _Text | None = None
     counted_bytes: Count | None = None
     state_bytes: Count = 0
     last_error_at: Int64 | None = None
     recovered: bool = False
-    unknown_types: tuple[_Text, ...] = ()
-    unheard: tuple[_Text, ...] = ()
-    fell_silent: tuple[_Text, ...] = ()
-    required_missing: tuple[_Text, ...] = ()
+    unknown_types: _Texts = ()
+    unheard: _Texts = ()
+    fell_silent: _Texts = ()
+    required_missing: _Texts = ()
     advice: _Text | None = None
     list_refused: _Text | None = None
 

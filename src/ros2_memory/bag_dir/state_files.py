@@ -65,6 +65,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
 
+_Span: TypeAlias = tuple[Int64, Int64]
+"""A span of log time (ns)."""
+
 # recorded.jsonl
 
 _Seconds: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=1e9)]
@@ -234,7 +237,7 @@ class Deleted:
 
     recording: str
     files: tuple[str, ...] = ()
-    spans: tuple[tuple[Int64, Int64], ...] = ()
+    spans: tuple[_Span, ...] = ()
 
 
 DELETED: Final = JsonLog(DELETED_FILE, Deleted, most_bytes=4 * _MOST_DELETED_BYTES)
@@ -366,7 +369,7 @@ class Thinned:
 
     since: Int64 | None = None
     silences: tuple[tuple[str, Int64, Int64, Int64, StrictBool], ...] = ()
-    pauses: tuple[tuple[Int64, Int64], ...] = ()
+    pauses: tuple[_Span, ...] = ()
     set_back: tuple[tuple[Int64, Int64], ...] = ()
     left_open: tuple[Int64, ...] = ()
 
@@ -583,7 +586,7 @@ class Erasure:
     """
 
     topics: tuple[str, ...]
-    windows: tuple[tuple[Int64, Int64], ...]
+    windows: tuple[_Span, ...]
     latched: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
     counts: tuple[Erased, ...] = ()
@@ -659,7 +662,7 @@ class RecordingScreen:
     end: Int64 | None = None
     files: dict[str, FileStep] = field(default_factory=dict)
     heard: dict[str, list[ConditionInterval]] = field(default_factory=dict)
-    unclear: list[tuple[Int64, Int64]] = field(default_factory=list)
+    unclear: list[_Span] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -694,8 +697,8 @@ class ScreenState:
 
     recordings: dict[str, RecordingScreen] = field(default_factory=dict)
     excluded: list[Excluded] = field(default_factory=list)
-    earlier: list[tuple[Int64, Int64]] = field(default_factory=list)
-    earlier_held: list[tuple[Int64, Int64]] = field(default_factory=list)
+    earlier: list[_Span] = field(default_factory=list)
+    earlier_held: list[_Span] = field(default_factory=list)
 
 
 class Withheld(NamedTuple):
