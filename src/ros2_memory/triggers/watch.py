@@ -11,9 +11,9 @@ from __future__ import annotations
 import threading
 import time
 import uuid
+from collections import defaultdict
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass
-from itertools import product
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
@@ -35,7 +35,7 @@ from ros2_memory.triggers.rules import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -65,6 +65,7 @@ class Triggers:
 
     Attributes:
         restarts: the restarts of the recording (wall times) that are still to be evaluated.
+        reported: when each rule last fired with a problem, by the kind of the problem.
     """
 
     bag_dir: Path
@@ -84,10 +85,9 @@ class Triggers:
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
         self.restarts: list[Span] = []
+        self.reported: defaultdict[str, dict[str, Ns]] = defaultdict(dict)
         self._deleted = 0
         self._is_written = False
-        # When a rule last fired with a problem, by its name and the kind of the problem.
-        self._reported: dict[tuple[str, str], Ns] = {}
 
     def note_restart(self, first: Ns, at: Ns) -> None:
         """Records that the recording ended unexpectedly and restarted between two wall times."""
@@ -102,17 +102,17 @@ class Triggers:
             OSError: the state or the list of recordings cannot be read, or the state not written.
         """
         state = deepcopy(self._current_state(snapshot))
-        self._search_closed(state, snapshot)
+        looks = {
+            name: _RuleLook(self, rule, state.rules[name], snapshot)
+            for name, rule in self._rules.items()
+        }
+        for firing in self._search_closed(state, snapshot):
+            looks[firing.rule].add(firing)
         with self._lock:
             restarts, self.restarts = self.restarts, []
             deleted, self._deleted = self._deleted, 0
-        for (first, at), rule in product(restarts, self._rules.values()):
-            if rule.kind == "recorder_restart":
-                self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
-        for name, rule in self._rules.items():
-            self._check_topic(rule, state.rules[name])
-            self._store_moments(name, state.rules[name], snapshot)
-            _note_lasting_match(name, state.rules[name])
+        for look in looks.values():
+            look.finish(restarts)
         if deleted:
             sentence = (
                 f"{counted(deleted, 'bag')} that rules may have needed were deleted to make room "
@@ -133,13 +133,13 @@ class Triggers:
             TRIGGERS.write(self.bag_dir, state)
             self._is_written = True
 
-    def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> None:
+    def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> Iterator[Firing]:
+        """Searches the closed bags for so long as a look may take; yields what fires."""
         deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
             found = self.search.search(chain, state, lambda: time.monotonic() > deadline)
-            for firing in found.firings:
-                self._add_firing(firing, state, snapshot)
+            yield from found.firings
             for part, window, _ in chain.parts:
                 state.searched[part] = max(min(window.stop, found.until), window.start)
             if not found.is_complete:
@@ -214,18 +214,6 @@ class Triggers:
                 searched |= {part: min(until, ends[part] + 1) for part in others}
         return searched | state.searched
 
-    def _check_topic(self, rule: Rule, record: RuleRecord) -> None:
-        """Stores and logs whether a rule can never fire since its topic is not recorded now."""
-        topic = rule.topic
-        if topic is None or any(mark in topic for mark in GLOB_MARKS):
-            return
-        never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
-        if self.is_recorded(topic):
-            record.problem = None if record.problem == never else record.problem
-        elif record.problem != never:
-            record.problem = never
-            _log.warning("rule_not_recorded", rule=rule.name, reason=never)
-
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
     ) -> tuple[dict[str, list[BagFile]], frozenset[str]]:
@@ -259,9 +247,19 @@ class Triggers:
         handover = read_handover(self.bag_dir / recording).handover
         return None if handover.state is Counting.PENDING else handover.previous
 
-    def _add_firing(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
-        """Counts a firing, and joins it to the newest moment of its rule or begins another."""
-        rule, record = self._rules[firing.rule], state.rules[firing.rule]
+
+@dataclass(eq=False, repr=False)
+class _RuleLook:
+    """One look for one rule, which changes the rule's record."""
+
+    triggers: Triggers
+    rule: Rule
+    record: RuleRecord
+    snapshot: Snapshot
+
+    def add(self, firing: Firing) -> None:
+        """Counts a firing, and joins it to the newest moment of the rule or begins another."""
+        rule, record = self.rule, self.record
         record.fired += 1
         record.last_fired = firing.at
         _log.info("trigger_fired", rule=rule.name, topic=firing.topic, at_ns=firing.at)
@@ -278,91 +276,104 @@ class Triggers:
                 f"it fires more often than it may begin moments (max_per_hour: "
                 f"{rule.max_per_hour}): narrow its condition, or raise for_s"
             )
-            self._refuse(rule.name, record, Refusal("often", reason))
+            self._refuse(Refusal("often", reason))
             return
         if newest is not None and not newest.stored:
-            self._store_moments(rule.name, record, snapshot)
+            self._store_moments()
         if len(record.newest) >= MOST_WAITING:
-            reason = f"{MOST_WAITING} of its moments wait to be stored"
-            self._refuse(rule.name, record, Refusal("waiting", reason))
+            self._refuse(Refusal("waiting", f"{MOST_WAITING} of its moments wait to be stored"))
             return
         record.begun.append(firing.at)
-        if not self._reported_recently(rule.name, firing.at):
+        if not self._reported_recently():
             record.problem = None
         # The same number after a kill, so that the moment is recognised.
         number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
         record.newest.append(RuleMoment(number, window.start, window.stop))
 
-    def _store_moments(self, name: str, record: RuleRecord, snapshot: Snapshot) -> None:
-        """Stores the waiting moments of a rule. Drops refused ones, and stored ones but the newest.
+    def finish(self, restarts: Iterable[Span]) -> None:
+        """Counts restarts, stores the moments that wait, and what keeps the rule from firing."""
+        if self.rule.kind == "recorder_restart":
+            for first, at in restarts:
+                self.add(Firing(self.rule.name, "", first, at))
+        self._check_topic()
+        self._store_moments()
+        self._note_lasting_match()
+
+    def _check_topic(self) -> None:
+        """Stores and logs whether the rule can never fire since its topic is not recorded now."""
+        topic, record = self.rule.topic, self.record
+        if topic is None or any(mark in topic for mark in GLOB_MARKS):
+            return
+        never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
+        if self.triggers.is_recorded(topic):
+            record.problem = None if record.problem == never else record.problem
+        elif record.problem != never:
+            record.problem = never
+            _log.warning("rule_not_recorded", rule=self.rule.name, reason=never)
+
+    def _store_moments(self) -> None:
+        """Stores the waiting moments. Drops refused ones, and stored ones but the newest.
 
         The next match may extend the newest moment.
         """
-        left = [
-            moment
-            for moment in record.newest
-            if moment.stored or self._store(name, record, moment, snapshot)
-        ]
+        record = self.record
+        left = [moment for moment in record.newest if moment.stored or self._store(moment)]
         record.newest = [moment for moment in left[:-1] if not moment.stored] + left[-1:]
 
-    def _store(self, name: str, record: RuleRecord, moment: RuleMoment, snapshot: Snapshot) -> bool:
+    def _store(self, moment: RuleMoment) -> bool:
         """Stores a moment, or reports why the disk cannot; returns False if it is refused."""
+        name, record = self.rule.name, self.record
         request = SaveRequest(
-            moment.number, self._rules[name].label, moment.start, moment.end, self.clock.now()
+            moment.number, self.rule.label, moment.start, moment.end, self.triggers.clock.now()
         )
         try:
-            refused = self.moments.keep_for_rule(request, name, moment.matches, snapshot)
+            keep = self.triggers.moments.keep_for_rule
+            refused = keep(request, name, moment.matches, self.snapshot)
         except OSError as error:
-            reason = f"its moments cannot be stored: {error.strerror or error}"
-            self._report(name, record, Refusal("disk", reason))
+            self._report(
+                Refusal("disk", f"its moments cannot be stored: {error.strerror or error}")
+            )
             return True
         moment.stored = True
         if refused is not None:
-            self._refuse(name, record, refused)
+            self._refuse(refused)
             if not moment.known:
                 # What saved nothing does not count in `max_per_hour`.
                 first, last = moment.start, moment.end
                 record.begun = [at for at in record.begun if not first <= at <= last]
             return False
-        if not moment.known:
-            record.moments += 1
+        record.moments += not moment.known
         moment.known = True
         return True
 
-    def _refuse(self, name: str, record: RuleRecord, refusal: Refusal) -> None:
-        record.refused += 1
-        self._report(name, record, refusal)
+    def _refuse(self, refusal: Refusal) -> None:
+        self.record.refused += 1
+        self._report(refusal)
 
-    def _report(self, name: str, record: RuleRecord, refusal: Refusal) -> None:
-        """Stores why a rule saves nothing, and logs each kind once for as long as it goes on."""
-        at = record.last_fired or 0
-        if refusal.kind not in self._reported_recently(name, at):
-            _log.warning("trigger_not_kept", rule=name, reason=refusal.sentence)
-        record.problem = refusal.sentence
-        self._reported[name, refusal.kind] = at
+    def _report(self, refusal: Refusal) -> None:
+        """Stores why the rule saves nothing, and logs each kind once for as long as it goes on."""
+        if refusal.kind not in self._reported_recently():
+            _log.warning("trigger_not_kept", rule=self.rule.name, reason=refusal.sentence)
+        self.record.problem = refusal.sentence
+        self.triggers.reported[self.rule.name][refusal.kind] = self.record.last_fired or 0
 
-    def _reported_recently(self, name: str, at: Ns) -> set[str]:
-        """Returns the kinds of problems that a rule had in the hour before it fired."""
-        return {
-            kind
-            for (rule, kind), last in self._reported.items()
-            if rule == name and abs(at - last) < NS_PER_HOUR
-        }
+    def _reported_recently(self) -> set[str]:
+        """Returns the kinds of problems that the rule had in the hour before it last fired."""
+        at, reported = self.record.last_fired or 0, self.triggers.reported[self.rule.name]
+        return {kind for kind, last in reported.items() if abs(at - last) < NS_PER_HOUR}
 
-
-def _note_lasting_match(name: str, record: RuleRecord) -> None:
-    """Stores since when a rule has matched for more than an hour, and logs it once."""
-    since = min(
-        (
+    def _note_lasting_match(self) -> None:
+        """Stores since when the rule has matched for more than an hour, and logs it once."""
+        record = self.record
+        lasting = [
             run.first
             for run in record.runs.values()
             if run.fired and run.last - run.first > NS_PER_HOUR
-        ),
-        default=None,
-    )
-    if since is not None and record.always_since is None:
-        _log.warning("trigger_matches_always", rule=name, since_ns=since)
-    record.always_since = since
+        ]
+        since = min(lasting, default=None)
+        if since is not None and record.always_since is None:
+            _log.warning("trigger_matches_always", rule=self.rule.name, since_ns=since)
+        record.always_since = since
 
 
 def _joins(moment: RuleMoment, window: TimeWindow) -> bool:
