@@ -199,8 +199,9 @@ def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tupl
     of_message = (spots[rows, name] for name in (Spot.SLICE, Spot.TOPIC, Spot.LABEL))
     seen_at, number = distinct_rows((place, *of_message))
     are_shared = _are_shared(seen_at[:, 0], np.bincount(number))
-    for number, positions in enumerate(rows_by(place, len(are_shared))):
-        yield rows[positions], bool(are_shared[number])
+    places = rows_by(place, len(are_shared))
+    for positions, is_shared in zip(places, are_shared.tolist(), strict=True):
+        yield rows[positions], is_shared
 
 
 def _are_shared(place: Ints, spots: Ints) -> Flags:
@@ -253,8 +254,8 @@ def _add_stays(groups: Sequence[LabelGroup], observed: Observations) -> None:
     width = len(observed.sights.epochs)
     keys = place * width + spots[rows, Spot.SLICE]
     bounds = [
-        (number * width + stay.first_slice, number * width + stay.last_slice + 1)
-        for number, stay in stays
+        (stay.place * width + stay.first_slice, stay.place * width + stay.last_slice + 1)
+        for stay in stays
     ]
     begin, end = np.searchsorted(keys, bounds_of(bounds))
     for group in groups:
@@ -327,7 +328,7 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) ->
             continue
         whole = stay.stay._replace(firm_first=-1, firm_last=-1)
         sizes = np.diff([0, *sorted(cuts), len(rows)])
-        split = placed_stays(observed, [(stay.place, whole)] * len(sizes), rows, sizes)
+        split = placed_stays(observed, [whole] * len(sizes), rows, sizes)
         split[0].misread_as = stay.misread_as
         parts += split
     return parts
@@ -365,9 +366,7 @@ def _without_overlap(stays: Sequence[PlacedStay], observed: Observations) -> lis
             begin = min(stays[number - 1].firm_last, stay.firm_first)
             rows = rows[spots[rows, Spot.FIRST] >= begin]
         if len(rows) < len(stay.spots):
-            [placed] = placed_stays(
-                observed, [(stay.place, stay.stay)], rows, np.array([len(rows)])
-            )
+            [placed] = placed_stays(observed, [stay.stay], rows, np.array([len(rows)]))
             trimmed.append(replace(placed, misread_as=stay.misread_as, left=stay.left))
         else:
             trimmed.append(stay)

@@ -38,19 +38,22 @@ class PlacedStay:
     """A stay of a label at a place, with the detections in it.
 
     Attributes:
+        spots: rows of `Sights.spots`, in order of time.
+        stay: the slices of the stay, and the number of the place.
+        left: when it was seen to be gone (ns); None if it was not.
+        is_weak: whether it was seen too rarely to be a thing.
         x, y, z: the mean place of the detections (mm); `dev_mm` is their root mean square distance
             from it.
         first, last: log times of the detections (ns); `firm_first` and `firm_last` are those of
             the detections beyond doubt.
         count: how many detections.
-        left: when it was seen to be gone (ns); None if it was not.
-        spots: rows of `Sights.spots`, in order of time.
-        place: the number of the place.
-        stay: the slices of the stay.
-        weak: whether it was seen too rarely to be a thing.
         misread_as: how often it was seen under the labels of other things.
     """
 
+    spots: Ints
+    stay: Stay
+    left: Ns | None
+    is_weak: bool
     x: float
     y: float
     z: float
@@ -60,12 +63,12 @@ class PlacedStay:
     firm_first: Ns
     firm_last: Ns
     count: int
-    left: Ns | None
-    spots: Ints
-    place: int
-    stay: Stay
-    weak: bool
     misread_as: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def place(self) -> int:
+        """The number of the place."""
+        return self.stay.place
 
     @property
     def at(self) -> Vector3:
@@ -202,12 +205,11 @@ class Estimate:
     @property
     def memory_bytes(self) -> int:
         """About how much memory the estimate takes."""
-        tables: list[Columns | Ints | Flags] = [self.spots, self.unplaced, self.counts, self.poor]
-        tables.append(self.carried)
-        tables += chain((self.stay_of,), self.scores, self.hits, self.looks)
-        tables += chain(self.unplaced_of.values(), *self.evidence.values())
-        tables += chain((stay.spots for _, stay in self.stays))
-        return sum(table.nbytes for table in tables)
+        of_spots = (self.counts, self.carried, self.poor, self.stay_of, *self.scores, *self.hits)
+        of_things = chain(self.unplaced_of.values(), *self.evidence.values())
+        of_stays = (stay.spots for _, stay in self.stays)
+        arrays = chain(of_spots, self.looks, of_things, of_stays)
+        return self.spots.nbytes + self.unplaced.nbytes + sum(array.nbytes for array in arrays)
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
         """Returns the spots whose slices reach into a window and end before a time.

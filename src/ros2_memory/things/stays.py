@@ -195,9 +195,9 @@ def groups_in(observed: Observations, keys: Sequence[str]) -> list[LabelGroup]:
 
 
 def placed_stays(
-    observed: Observations, stays: Sequence[tuple[int, Stay]], rows: Ints, sizes: Ints
+    observed: Observations, stays: Sequence[Stay], rows: Ints, sizes: Ints
 ) -> list[PlacedStay]:
-    """Returns stays with what their spots say. Each comes with the number of its place.
+    """Returns stays with what their spots say.
 
     `rows` are the spots of one stay after the other, `sizes` how many each has, at least one.
     """
@@ -213,7 +213,7 @@ def placed_stays(
     squares = np.add.reduceat(n * (spots[:, Spot.DEV] ** 2 + off), begins)
     dev_mm = np.sqrt(squares / count)
     slices, first, last = spots[:, Spot.SLICE], spots[:, Spot.FIRST], spots[:, Spot.LAST]
-    firm_from, firm_to = np.array([(stay.firm_first, stay.firm_last) for _, stay in stays]).T
+    firm_from, firm_to = np.array([(stay.firm_first, stay.firm_last) for stay in stays]).T
     is_firm = (slices >= firm_from[stay_of]) & (slices <= firm_to[stay_of])
     # Without a firm spot, or without firm slices (-1), all spots count as firm.
     has_firm = np.maximum.reduceat(is_firm, begins) & (firm_from >= 0)
@@ -222,20 +222,13 @@ def placed_stays(
     firm_last = np.maximum.reduceat(np.where(is_firm, last, -MAX_NS), begins)
     first, last = np.minimum.reduceat(first, begins), np.maximum.reduceat(last, begins)
     columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count)
+    placed = []
     numbers = zip(*(column.tolist() for column in columns), strict=True)
-    return [
-        PlacedStay(
-            *row,
-            left=None if stay.left is None else observed.cells.looked_in(stay.left),
-            spots=own_rows,
-            place=place,
-            stay=stay,
-            weak=stay.clear_hits < FEWEST or stay.hits < _LOWEST_RATE * stay.messages,
-        )
-        for (place, stay), own_rows, row in zip(
-            stays, np.split(rows, begins[1:]), numbers, strict=True
-        )
-    ]
+    for stay, own_rows, row in zip(stays, np.split(rows, begins[1:]), numbers, strict=True):
+        left = None if stay.left is None else observed.cells.looked_in(stay.left)
+        is_weak = stay.clear_hits < FEWEST or stay.hits < _LOWEST_RATE * stay.messages
+        placed.append(PlacedStay(own_rows, stay, left, is_weak, *row))
+    return placed
 
 
 def end_where_carried_away(group: LabelGroup, observed: Observations) -> None:
@@ -278,7 +271,7 @@ def remove_false_stays(
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):
-        if number not in false_stays and not stay.weak:
+        if number not in false_stays and not stay.is_weak:
             group.stays.append(stay)
 
 
@@ -307,7 +300,7 @@ class _HostSearch:
                 stay.last,
                 stay.stay.first_slice,
                 stay.stay.last_slice,
-                stay.weak,
+                stay.is_weak,
             )
             for group, stay in stays
         ]

@@ -133,5 +133,5 @@ def _pairs_in_turn_at(spots: Ints, n: Ints, key: Ints) -> Ints:
     pairs, pair = distinct_rows((seen_in[one, 1], seen_in[other, 1]))
     turns, other_turns = (np.bincount(pair, seen[which], len(pairs)) for which in (one, other))
     fewest = np.maximum(_FEWEST_TURNS, _LEAST_SHARE * (turns + other_turns))
-    in_turn = np.minimum(turns, other_turns) >= fewest
-    return pairs[in_turn]
+    alternating: Ints = pairs[np.minimum(turns, other_turns) >= fewest]
+    return alternating

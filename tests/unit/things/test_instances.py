@@ -158,7 +158,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     assert not seen_in & {*cells.slice[left_out].tolist()}
     assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
     assert [*stays_at(cells, found)] == [*stays_at(cells, whole)]
-    for _, stay in stays_at(cells, found):
+    for stay in stays_at(cells, found):
         for after in (0, int(cells.last[len(cells.last) // 2])):
             by = stay, after, (after + 1, MAX_NS)
             assert count_misses(cells.looks, found.at_place(0), *by) == count_misses(
