@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import Flags, Ints, joined_codes, range_numbers, stable_order
+from ros2_memory.core.arrays import (
+    Flags,
+    Ints,
+    joined_codes,
+    range_numbers,
+    sorted_codes,
+    stable_order,
+)
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
@@ -129,8 +136,8 @@ class IntervalTable(NamedTuple):
         if self.size <= at_most:
             return self
         rows = self._array[np.sort(self._by_length()[:at_most])]
-        used, rows["label"] = np.unique(rows["label"], return_inverse=True)
-        return IntervalTable(tuple(self.labels[code] for code in used.tolist()), rows.tobytes())
+        rows["label"], labels = sorted_codes(rows["label"], self.labels)
+        return IntervalTable(labels, rows.tobytes())
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
@@ -201,11 +208,9 @@ def visible_in(
     """
     if not rows.size:
         return IntervalTable()
-    used, codes = np.unique(codes, return_inverse=True)
-    names = [labels[code] for code in used.tolist()]
-    rank = np.argsort(np.argsort(np.array(names, object)))
-    order = np.lexsort((rows, rank[codes]))
-    label, row = rank[codes][order], rows[order]
+    label, names = sorted_codes(codes, labels)
+    order = np.lexsort((rows, label))
+    label, row = label[order], rows[order]
     at = times[row]
     # Each detection begins as an interval of its own. Of two with one label in a message, the
     # second one adds no message to the count.
@@ -218,7 +223,7 @@ def visible_in(
     silences = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
     goes_on = (np.diff(row + silences[row]) <= 1) | (np.diff(at) <= FLICKER_NS)
     goes_on &= np.diff(label) == 0
-    return IntervalTable(tuple(sorted(names)), _merge_runs(seen, at, goes_on))
+    return IntervalTable(names, _merge_runs(seen, at, goes_on))
 
 
 def _stored_scores(scores: NDArray[np.float64]) -> Ints:
@@ -242,10 +247,8 @@ def united_tables(
     if not rows.size:
         return IntervalTable()
     part = range_numbers([table.size for table in tables])
-    codes, words = joined_codes((table._array["label"], table.labels) for table in tables)
-    labels = tuple(sorted(words))
-    place = {label: at for at, label in enumerate(labels)}
-    label = np.array([place[word] for word in words], np.intp)[codes]
+    codes = joined_codes((table._array["label"], table.labels) for table in tables)
+    label, labels = sorted_codes(*codes)
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
     first, ends, reach = rows["first"], rows["ends"], running_end(label, rows["last"])

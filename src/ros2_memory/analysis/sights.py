@@ -29,6 +29,7 @@ from ros2_memory.core.arrays import (
     distinct_rows,
     rows_of,
     run_starts,
+    sorted_codes,
     stable_order,
 )
 from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
@@ -278,11 +279,8 @@ def _leans(up: Sequence[Floats]) -> Ints:
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels, sorted."""
     # A label without a detection is of other messages, which may be forgotten.
-    used, nth_used = np.unique(seen.labels, return_inverse=True)
-    short_names = [shortened(seen.names[code], MAX_LABEL_CHARS) for code in used.tolist()]
-    names = sorted({*short_names})
-    number = {name: nth for nth, name in enumerate(names)}
-    label = np.array([number[name] for name in short_names], np.int64)[nth_used]
+    short_names = [shortened(name, MAX_LABEL_CHARS) for name in seen.names]
+    label, names = sorted_codes(seen.labels, short_names)
     with np.errstate(invalid="ignore"):
         is_placed: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(is_placed[:, None], seen.places, 0.0)).T
@@ -294,7 +292,7 @@ def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tupl
         slice_begins = np.repeat(begins, np.diff(begins, append=len(rows)))
         nth_in_slice = np.arange(len(rows)) - slice_begins
         detections = rows_of(detections, (nth_in_slice <= MAX_LABELS)[nth])
-    return detections, tuple(names)
+    return detections, names
 
 
 def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:

@@ -184,6 +184,15 @@ def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, t
     return np.concatenate(codes), tuple(code_of)
 
 
+def sorted_codes(codes: Codes, words: Sequence[str]) -> tuple[Ints, tuple[str, ...]]:
+    """Returns the words that rows have, each once and in order, and the code of each row's."""
+    used, nth_used = np.unique(codes, return_inverse=True)
+    used_words = [words[code] for code in used.tolist()]
+    ordered = sorted({*used_words})
+    code_of = {word: code for code, word in enumerate(ordered)}
+    return np.array([code_of[word] for word in used_words], np.int64)[nth_used], tuple(ordered)
+
+
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
     """Merges the times (ns) of several parts; equal times stay in the order of the parts.
 
