@@ -100,8 +100,6 @@ class Poses:
     def between(self, start: int, stop: int) -> Poses:
         """Returns the poses with log times (ns) in `[start, stop)`."""
         first, end = np.searchsorted(self.times, (start, stop)).tolist()
-        if end - first == len(self):
-            return self
         return self.rows(slice(first, end))
 
 

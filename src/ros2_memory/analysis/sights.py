@@ -27,6 +27,8 @@ from ros2_memory.core.arrays import (
     Groups,
     Ints,
     distinct_rows,
+    pair_counts,
+    places_within,
     rows_of,
     run_starts,
     sorted_codes,
@@ -216,9 +218,9 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     tables = (
         _spots(placed, spot, seen.times, together[group[in_spot]]),
         looks,
-        _pair_counts(spot, look[placed.message]),
-        _pair_counts(spot[is_scored], bin_of(_thousandths(placed.score[is_scored]))),
-        _pair_counts(spot[row], other_label),
+        pair_counts(spot, look[placed.message]),
+        pair_counts(spot[is_scored], bin_of(_thousandths(placed.score[is_scored]))),
+        pair_counts(spot[row], other_label),
         _unplaced(rows_of(detections, ~in_spot), seen.times),
         np.zeros((0, len(Fix)), np.int64),
     )
@@ -289,8 +291,7 @@ def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tupl
     if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = run_starts(rows[:, 0])
-        slice_begins = np.repeat(begins, np.diff(begins, append=len(rows)))
-        nth_in_slice = np.arange(len(rows)) - slice_begins
+        nth_in_slice = places_within(np.diff(begins, append=len(rows)))
         detections = rows_of(detections, (nth_in_slice <= MAX_LABELS)[nth])
     return detections, names
 
@@ -470,12 +471,6 @@ def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
         others += [b[is_near], a[is_near]]
     rows, _ = distinct_rows((np.concatenate(ones), detections.label[np.concatenate(others)]))
     return rows[:, 0], rows[:, 1]
-
-
-def _pair_counts(first: Ints, other: Ints) -> Ints:
-    """Returns the distinct pairs, and how often each occurs, as rows of three."""
-    rows, nth = distinct_rows((first, other))
-    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
 
 
 def _mm(metres: Floats) -> Ints:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
 from ros2_memory.analysis.intervals import SILENCE_NS, IntervalTable, united_tables, visible_in
-from ros2_memory.core.arrays import joined_codes, stable_order
+from ros2_memory.core.arrays import joined_codes, run_starts, stable_order
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -237,8 +237,7 @@ def _new_states(stated: Stated) -> Iterator[KnownState]:
     names, _ = joined_codes([(facts.codes, [word[:2] for word in facts.words])])
     order = stable_order(names)
     values = facts.values.astype(np.int64)
-    is_new = (np.diff(names[order], prepend=-1) != 0) | (np.diff(values[order], prepend=0) != 0)
-    new = np.sort(order[is_new])
+    new = np.sort(order[run_starts(names[order], values[order])])
     codes, times = facts.codes[new].tolist(), stated.times[facts.rows[new]].tolist()
     for code, at, value in zip(codes, times, values[new].tolist(), strict=True):
         kind, name, text = facts.words[code]

@@ -138,13 +138,20 @@ def rows_by(group: Ints, groups: int) -> list[Ints]:
     return np.split(stable_order(group), begins_of(group, groups)[1:])[:-1]
 
 
-def run_starts(*columns: Ints) -> Ints:
+def run_starts(*columns: Ints | Flags) -> Ints:
     """Returns where each run of equal rows begins; the columns are of one length."""
     is_other = np.zeros(len(columns[0]), np.bool_)
     is_other[:1] = True
     for column in columns:
         is_other[1:] |= column[1:] != column[:-1]
     return np.flatnonzero(is_other)
+
+
+def runs_where(marks: Flags, *columns: Ints) -> Ints:
+    """Returns where each run of equal rows that are marked begins and stops: rows of two."""
+    starts = run_starts(marks, *columns)
+    runs: Ints = np.stack((starts, np.append(starts, marks.size)[1:]), axis=1)
+    return runs[marks[starts]]
 
 
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
@@ -228,6 +235,12 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     else:
         distinct, index = np.unique(keys, return_inverse=True)
     return np.stack(np.unravel_index(distinct, sizes), axis=1) + np.array(lows), index
+
+
+def pair_counts(first: Ints, other: Ints) -> Ints:
+    """Returns the distinct pairs, and how often each occurs, as rows of three."""
+    rows, nth = distinct_rows((first, other))
+    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
 
 
 def narrowed(column: Ints) -> Ints:

@@ -23,6 +23,7 @@ from ros2_memory.analysis.intervals import (
     visible_in,
 )
 from ros2_memory.analysis.topic_events import TopicEvents, joined_visible
+from ros2_memory.core.arrays import pair_counts
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
@@ -279,16 +280,13 @@ def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock
     times, detections = detected.log_times, detected.found
     labels = detections.labels.words
     rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
-    pairs, sizes = np.unique(rows * max(len(labels), 1) + codes, return_counts=True)
+    _, code_of_pair, sizes = pair_counts(rows, codes).T
     most_of_codes = np.zeros(len(labels), np.int64)
-    np.maximum.at(most_of_codes, pairs % max(len(labels), 1), sizes)
-    most_at_once = Counter[str]()
-    for label, most in zip(labels, most_of_codes.tolist(), strict=True):
-        most_at_once[label] = max(most_at_once[label], most)
+    np.maximum.at(most_of_codes, code_of_pair, sizes)
     visible = visible_in(times, rows, codes, detections.scores[counts], labels)
     return _SeenBlock(
         source,
         TopicEvents(int(times[0]), int(times[-1]), visible),
-        most_at_once,
+        Counter(dict(zip(labels, most_of_codes.tolist(), strict=True))),
         int(np.bincount(rows).max(initial=0)),
     )

@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ros2_memory.core.arrays import Flags, Floats, Vectors, row_maxima, row_sums
+from ros2_memory.core.arrays import Flags, Floats, Vectors, row_maxima, row_sums, runs_where
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
@@ -204,7 +204,7 @@ def measure(seconds: Floats, positions: Vectors) -> Measured:
     # Creeps replace the steps in them. Those at the ends are counted once the path is joined.
     moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
     first_creep = last_creep = None
-    for begin, end in runs_of(stationary):
+    for begin, end in runs_where(stationary).tolist():
         if end - begin < min(_STATIONARY_STEPS, len(plain)):
             continue
         run = slice(begin, end + 1)
@@ -263,7 +263,7 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> _StepLengths:
     lengths[as_plain] = plain[as_plain]
     # A wide slope before a sudden start reaches into the steps after it, which count by themselves.
     # So no run may be longer than its plain length.
-    for begin, end in runs_of(~as_plain):
+    for begin, end in runs_where(~as_plain).tolist():
         most, summed = plain[begin:end].sum(), lengths[begin:end].sum()
         if summed > most:
             lengths[begin:end] *= most / summed
@@ -309,12 +309,6 @@ def _extended(rows: Vectors, before: int, count: int) -> Vectors:
     inner[:] = rows[: len(inner)]
     extended[before + len(rows) :] = rows[-1]
     return extended
-
-
-def runs_of(marks: Flags) -> list[list[int]]:
-    """Returns the half-open ranges in which all marks are set."""
-    edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
-    return edges.reshape(-1, 2).tolist()
 
 
 def _creep(places: Vectors, reach: Floats, origin: Floats, varies: Flags) -> Creep:

@@ -161,7 +161,7 @@ def slot_ends(times: Ints, recordings: Ints | int = 0) -> NDArray[np.intp]:
     time.
     """
     numbers = np.broadcast_to(recordings, times.shape)
-    first = np.flatnonzero(_is_new(times, numbers))
+    first = run_starts(times, numbers)
     is_new = _is_new(times[first] // _SLOT_NS, numbers[first])
     return first[is_new | _is_last(is_new)]
 

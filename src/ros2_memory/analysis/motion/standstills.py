@@ -54,6 +54,7 @@ from ros2_memory.core.arrays import (
     row_sums,
     rows_of,
     run_starts,
+    runs_where,
     stacked,
 )
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, unix_from_ns
@@ -297,9 +298,7 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     if not inner.size:
         return NO_BLOCKS
     numbers = slots.numbers[inner] * SLOT_NS // BLOCK_NS
-    is_new = np.ones(inner.size, np.bool_)
-    is_new[1:] = (np.diff(numbers) != 0) | (np.diff(chains[inner]) != 0)
-    begins = np.flatnonzero(is_new)
+    begins = run_starts(numbers, chains[inner])
     firsts, lasts = inner[begins], inner[np.r_[begins[1:], inner.size] - 1]
     first_times, last_times = slots.firsts[firsts], slots.lasts[lasts]
     starts_ns = numbers[begins] * BLOCK_NS
@@ -321,7 +320,7 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
         np.full(begins.size, MIN_NS),
     )
     chain = chains[firsts]
-    for begin, stop in zip(*_runs(blocks.are_still(), chain), strict=True):
+    for begin, stop in runs_where(blocks.are_still(), chain).tolist():
         # Between blocks of motion in one chain, noise may hide slow motion for so short a time.
         is_inside = begin > 0 and stop < chain.size and chain[begin - 1] == chain[stop]
         if is_inside and last_times[stop - 1] - first_times[begin] < SHORTEST_NS:
@@ -470,7 +469,7 @@ def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
     chain = np.cumsum(begins_chain)
     is_still = blocks.are_still()
     moves = _creeping(blocks, chain, is_still) | ~is_still
-    begins, stops = _runs(~moves, chain)
+    begins, stops = runs_where(~moves, chain).T
     starts, ends = blocks.starts[begins], blocks.ends[stops - 1]
     starts = np.where(starts == MIN_NS, firsts[begins], starts)
     ends = np.where(ends == MIN_NS, lasts[stops - 1], ends)
@@ -512,13 +511,6 @@ def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Itera
     lows, highs = np.minimum.reduceat(lows, edges)[::2], np.maximum.reduceat(highs, edges)[::2]
     for (a, b, c), (d, e, f) in zip(lows.tolist(), highs.tolist(), strict=True):
         yield Box3((a, b, c), (d, e, f))
-
-
-def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
-    """Returns the begins and the stops of half-open ranges of one chain in which marks are set."""
-    is_new = np.r_[True, (np.diff(chain) != 0) | ~marks[:-1]]
-    is_over = np.r_[(np.diff(chain) != 0) | ~marks[1:], True]
-    return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
 
 
 def _split_by_drift(

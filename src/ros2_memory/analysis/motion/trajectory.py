@@ -25,9 +25,17 @@ from ros2_memory.analysis.motion.odometry import (
     are_places,
     measured_path,
 )
-from ros2_memory.analysis.motion.path_length import SPEED_STEPS, runs_of
+from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import WANDERS_M, Poses, headings, joined_poses
-from ros2_memory.core.arrays import Flags, Floats, Vectors, rows_of, stable_order, stacked
+from ros2_memory.core.arrays import (
+    Flags,
+    Floats,
+    Vectors,
+    rows_of,
+    runs_where,
+    stable_order,
+    stacked,
+)
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -276,7 +284,7 @@ def _without_wander(poses: Poses) -> Vectors:
     if not at_rest.any():
         return positions
     positions = positions.copy()
-    for begin, end in runs_of(at_rest):
+    for begin, end in runs_where(at_rest).tolist():
         place = positions[begin:end].mean(axis=0)
         if (np.abs(positions[begin:end] - place) <= _WIDEST_WANDER * WANDERS_M).all():
             positions[begin:end] = place
