@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +25,7 @@ import pyarrow.parquet as pq
 from ros2_memory.bag_dir.layout import recorded_as
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
-from ros2_memory.core.timebase import NS_PER_DAY, NS_PER_S
+from ros2_memory.core.timebase import NS_PER_DAY, utc_day
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -195,8 +194,9 @@ def _new_file(folder: Path, recording: str, day: int, others: Collection[Path]) 
     Raises:
         InvalidArgumentsError: an earlier export wrote files there.
     """
-    date = datetime.fromtimestamp(day * NS_PER_DAY // NS_PER_S, tz=UTC).date()
-    partition = folder / f"recording={quote(recording, safe=' ')}" / f"date={date}"
+    partition = (
+        folder / f"recording={quote(recording, safe=' ')}" / f"date={utc_day(day * NS_PER_DAY)}"
+    )
     if any(partition.glob("*.parquet")):
         raise InvalidArgumentsError(
             f"{partition} has rows already, which would be there twice; export whole days (UTC)"

@@ -14,7 +14,7 @@ import re
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from datetime import time as clock_time
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -100,6 +100,11 @@ def ms_since(begun: Ns) -> float:
     return round(ms_from_ns(time.perf_counter_ns() - begun), 3)
 
 
+def utc_day(ns: Ns) -> date:
+    """Returns the day (UTC) of a time."""
+    return datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).date()
+
+
 def iso_local(ns: Ns) -> str | None:
     """Returns ISO 8601 local time with offset; None for years that the calendar does not have.
 
@@ -161,12 +166,12 @@ def unix_from_text(text: str) -> float:
     iso = written if _ISO.fullmatch(written) else ""
     iso, days_later = _END_OF_DAY.subn("00:00", iso)
     try:
-        date = datetime.fromisoformat(iso)
-        seconds = (date + timedelta(days=days_later)).timestamp()
+        moment = datetime.fromisoformat(iso)
+        seconds = (moment + timedelta(days=days_later)).timestamp()
     except (ValueError, OverflowError, OSError):
         raise ValueError("is not a valid time in ISO 8601, such as 2026-11-20T14:05:00") from None
-    if weekday is not None and weekday != _WEEKDAYS[date.weekday()]:
-        raise ValueError(f"is a {_WEEKDAYS[date.weekday()]}, not a {weekday}")
+    if weekday is not None and weekday != _WEEKDAYS[moment.weekday()]:
+        raise ValueError(f"is a {_WEEKDAYS[moment.weekday()]}, not a {weekday}")
     return seconds
 
 
@@ -197,8 +202,8 @@ def require_no_date(seconds: float) -> None:
     """
     digits = str(seconds).removesuffix(".0")
     if _DATE_WITHOUT_DASHES.fullmatch(digits):
-        date = f"{digits[:4]}-{digits[4:6]}-{digits[6:]}"
-        raise ValueError(f"as Unix seconds is in 1970; the date is {date}")
+        day = f"{digits[:4]}-{digits[4:6]}-{digits[6:]}"
+        raise ValueError(f"as Unix seconds is in 1970; the date is {day}")
 
 
 def rest_of_text_s(text: str) -> float:
@@ -250,10 +255,10 @@ def _written_span_s(written: str) -> float:
         return rest_of_text_s(written)
     if _MINUTES.search(written):
         return _MINUTE_S - _END_S
-    date = datetime.fromisoformat(written)
-    if (date.hour, date.minute) != (0, 0) or "T" in written.upper():
+    midnight = datetime.fromisoformat(written)
+    if (midnight.hour, midnight.minute) != (0, 0) or "T" in written.upper():
         return 0.0
-    return (date + timedelta(days=1)).timestamp() - date.timestamp() - _END_S
+    return (midnight + timedelta(days=1)).timestamp() - midnight.timestamp() - _END_S
 
 
 def _split_weekday(text: str) -> tuple[str | None, str]:

@@ -6,7 +6,6 @@ import contextvars
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
@@ -23,7 +22,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import abbreviate, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Clock, Ns, utc_day
 from ros2_memory.history.context import Call, Memory, Stages
 
 if TYPE_CHECKING:
@@ -72,9 +71,8 @@ class LakeReport(NamedTuple):
         """The note on days that were not looked at, if there are any."""
         if self.older is None:
             return []
-        since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
         do = ": an end (or before, or a time) there has them looked at" if self.takes_time else ""
-        return [f"the lake has days before {since}, which were not looked at{do}"]
+        return [f"the lake has days before {utc_day(self.older + 1)}, which were not looked at{do}"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

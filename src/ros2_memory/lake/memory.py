@@ -19,10 +19,10 @@ from ros2_memory.columns.pack import is_large
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
 from ros2_memory.core.model import COMPRESSED, BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import ns_from_unix
+from ros2_memory.core.timebase import ns_from_unix, utc_day
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
+from ros2_memory.lake.tables import ShippedBag, end_of, unpacked_messages
 from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
 from ros2_memory.storage.cache import shared
 
@@ -168,7 +168,7 @@ class LakeIndex:
             days = [*self.lake.days("bags").get(self.robot, {})]
             if not days:  # all was forgotten since
                 return replace(current, timeline=Timeline(), older=None)
-            later = bisect_right(days, day_of(reach))
+            later = bisect_right(days, utc_day(reach))
             first, until = days[max(later - 1, 0)], days[min(later, len(days) - 1)]
             window = self._window(until, (until - first).days + 1)
         return replace(current, timeline=window.timeline, older=window.older)

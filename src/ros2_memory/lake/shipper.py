@@ -33,9 +33,9 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError, BusyError, EpisodicError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, Clock, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, Clock, Ns, utc_day
 from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
-from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, day_of, window_condition
+from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, window_condition
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
@@ -528,7 +528,7 @@ class RobotBags:
         return ShippedBag(
             robot=self.name,
             bag_id=bag_id,
-            day=day_of(bag.start),
+            day=utc_day(bag.start),
             file=self.name_of(bag),
             size=bag.size,
             sha256=sha256,

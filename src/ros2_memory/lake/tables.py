@@ -197,11 +197,6 @@ class ShippedBag(NamedTuple):
     end_ns: Ns
 
 
-def day_of(time_ns: Ns) -> date:
-    """Returns the day (UTC) of a time."""
-    return datetime.fromtimestamp(time_ns // NS_PER_S, tz=UTC).date()
-
-
 def end_of(day: date) -> Ns:
     """Returns the last log time of a day (UTC)."""
     next_day = datetime(day.year, day.month, day.day, tzinfo=UTC) + timedelta(days=1)

@@ -24,12 +24,11 @@ from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, NS_PER_MS, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, NS_PER_MS, Ns, utc_day
 from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import (
     TABLES,
     bags_condition,
-    day_of,
     rows_with,
     window_condition,
 )
@@ -68,7 +67,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    closed = day_of(now - NS_PER_DAY)
+    closed = utc_day(now - NS_PER_DAY)
     done = 0
     for name in TABLES:
         for day, robots in _to_compact(lake.days(name), closed):

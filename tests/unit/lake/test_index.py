@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Deadline
+from ros2_memory.core.timebase import NS_PER_S, Deadline, utc_day
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.fields import describe_type
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import LakeIndex, newest_days
-from ros2_memory.lake.tables import NAMESPACE, TABLES, day_of, open_tables
+from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import Days, LakeFile
 from tests.support.bags import Msg, battery, boolean, detections, text, write_mcap
@@ -86,7 +86,7 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
     shipping.ship([old, old + 60, now])
     robot = shipping.robot()
     assert starts(robot) == [old, old + 60, now]
-    days = [str(day_of(at * NS_PER_S)) for at in (old - DAY_S, old, old + DAY_S, now)]
+    days = [str(utc_day(at * NS_PER_S)) for at in (old - DAY_S, old, old + DAY_S, now)]
     assert shipping.lake.days_read() == {days[1], days[3]}
     for new, looked_at in (
         ([], set()),
