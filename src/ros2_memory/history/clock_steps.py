@@ -84,16 +84,25 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     steps = [step for step in around if window.overlaps(step.at, step.at + max(step.by - 1, 0))]
     _note_pauses(view, window)
     for at, by in steps:
-        when = unix_text(at)
-        if by > 0:
-            note = f"the clock was set {seconds(by)} ahead at {when}: durations are without that"
-        else:
-            note = (
-                f"the clock was set back by {seconds(-by)} or more at {when}: durations across "
-                "that are too short by as much"
-            )
-        view.notes.add(note)
+        view.notes.add(_describe_step(at, by))
     return Elapsed(steps)
+
+
+def note_skipped(view: View, window: TimeWindow) -> None:
+    """Notes the step of the clock that skipped a whole window."""
+    for at, by in _steps_in_time(view, window) or ():
+        if at <= window.start and window.stop <= at + by:
+            view.notes.add(_describe_step(at, by))
+
+
+def _describe_step(at: Ns, by: Ns) -> str:
+    if by > 0:
+        ahead = f"the clock was set {seconds(by)} ahead at {unix_text(at)}"
+        return f"{ahead}: durations are without that"
+    return (
+        f"the clock was set back by {seconds(-by)} or more at {unix_text(at)}: durations across "
+        "that are too short by as much"
+    )
 
 
 def _steps_in_time(view: View, window: TimeWindow) -> list[ClockStep] | None:

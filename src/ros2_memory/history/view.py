@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.clock_steps import elapsed_in, without_steps
+from ros2_memory.history.clock_steps import elapsed_in, note_skipped, without_steps
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
@@ -180,6 +180,10 @@ class View:
     def elapsed_in(self, window: TimeWindow) -> Elapsed:
         """Returns how much time passed between moments of a window, with a note on each step."""
         return elapsed_in(self, window)
+
+    def note_skipped(self, window: TimeWindow) -> None:
+        """Notes the step of the clock that skipped a whole window."""
+        note_skipped(self, window)
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns by type the totals of a topic, each message counted once.
