@@ -58,7 +58,7 @@ _STEPS_BYTES: Final = 1_000
 
 
 def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
-    """Returns when the clock was set (in a window), in order of time.
+    """Returns when the clock was set (in a window, or over a part of it), in order of time.
 
     A step back of 2 s or more shows in the order of log times. A step forward looks like a pause of
     a recording: of 2 s or more if the robot drove through it, of 0.5 s or more if the header stamps
@@ -66,7 +66,11 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     """
     window = TimeWindow.everything() if window is None else window
     _note_pauses(view, window)
-    return tuple(step for step in _steps_around(view, window) if window.contains(step.at))
+    return tuple(step for step in _steps_around(view, window) if _reaches_into(window, step))
+
+
+def _reaches_into(window: TimeWindow, step: ClockStep) -> bool:
+    return window.overlaps(step.at, step.at + max(step.by - 1, 0))
 
 
 def without_steps(view: View, gaps: Sequence[Span]) -> Sequence[Span]:
@@ -81,7 +85,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     around = _steps_in_time(view, window)
     if around is None:
         return Elapsed()
-    steps = [step for step in around if window.overlaps(step.at, step.at + max(step.by - 1, 0))]
+    steps = [step for step in around if _reaches_into(window, step)]
     _note_pauses(view, window)
     for at, by in steps:
         view.notes.add(_describe_step(at, by))

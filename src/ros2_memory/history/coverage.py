@@ -679,12 +679,10 @@ def is_missed(snapshot: Snapshot, window: TimeWindow, start: Ns, end: Ns) -> boo
     return stop - begin > least or (begin, stop) == (first, last)
 
 
-def recording_gaps(
-    view: View, window: TimeWindow | None = None, *, steps: bool = False
-) -> Iterator[Span]:
+def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[Span]:
     """Yields the gaps (in a window, cut at its bounds); see `View.gaps`."""
     asked = window or TimeWindow.everything()
-    for start, end in view.gaps(asked, steps=steps):
+    for start, end in view.gaps(asked):
         yield max(start, asked.start), min(end, asked.stop)
 
 
@@ -704,7 +702,7 @@ def unknown_times(
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (0, 0)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
-    gaps = united(recording_gaps(view, steps=True))  # the time that the clock skipped never was
+    gaps = united([*recording_gaps(view), *view.elapsed_in(window).skipped])
     between = without([around], united([*known, *mixed, *gaps]))
     long = [(begin, stop) for begin, stop in between if stop - begin > SILENCE_NS]
     unknown: Spans = []

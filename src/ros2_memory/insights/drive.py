@@ -28,7 +28,7 @@ from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import without
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -164,7 +164,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     window = TimeWindow(begin, window.stop)
     (start, end), gaps = shown_span(view.snapshot, window), [*recording_gaps(view, window)]
     recorded = elapsed.among(without([(start, end)], gaps))
-    beyond = without([(start, path.first), (path.last, end)], gaps)
+    absent = united([*gaps, *elapsed.skipped])
+    beyond = without([(start, path.first), (path.last, end)], absent)
     long = [span_text(*span) for span in beyond if span[1] - span[0] > NEWEST_POSE_NS]
     if long:
         view.notes.add(f"{topic} has no poses from {listed(long)}: the path is without that time")

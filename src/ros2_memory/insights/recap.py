@@ -440,7 +440,8 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
             yield Event("gap", begin, until, _gap_sentence(view, begin, until))
     for at, by in clock_steps(view, window):
         how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
-        yield Event("clock step", at, None, f"the clock was set {how}")
+        if window.contains(at):
+            yield Event("clock step", at, None, f"the clock was set {how}")
     for group in group_silences(silences_in(view, window)):
         topics, first = listed([silence.topic for silence in group]), group[0]
         text = f"{topics} {'was' if len(group) == 1 else 'were'} silent"

@@ -112,6 +112,20 @@ def test_what_the_clock_skipped_is_neither_recorded_nor_missing(tmp_path: Path) 
             assert (missing["error"], missing["notes"]) == ("no_data", [note])
 
 
+def test_a_window_that_ends_in_what_the_clock_skipped_lacks_nothing(tmp_path: Path) -> None:
+    plain = recorded(tmp_path, shown=lambda t: t + 500.0 * (t > 54.95))
+    cut = {"start": BEGIN + 5, "end": BEGIN + 300}
+    note = f"the clock was set 500 s ahead at {BEGIN + 54}.900000: durations are without that"
+    for memory in each_known(plain):
+        later = {"with_start": BEGIN + 400, "with_end": BEGIN + 600}
+        assert asked(memory, "recap", **cut)["notes"] == [note]
+        assert asked(memory, "visits", x=0.0, y=0.0, **cut)["notes"] == [note]
+        told = asked(memory, "compare", **cut, **later)["notes"]
+        assert [each for each in told if "known" in each or "poses" in each] == []
+        inside = asked(memory, "data_time_range", start=BEGIN + 200, end=BEGIN + 300)
+        assert [step["step_s"] for step in inside["clock_steps"]] == [pytest.approx(500, abs=0.1)]
+
+
 def test_the_age_of_a_latched_value_is_without_what_the_clock_skipped(tmp_path: Path) -> None:
     messages = [text(BEGIN * S + 50 * S, "on", topic="/mode")]
     for beat in range(160 * HZ):
