@@ -175,6 +175,11 @@ def _note_labels(view: View, topics: Sequence[str], unknown: Ns, labels: int) ->
             "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
             "search texts"
         )
+    elif not labels:
+        view.notes.add(
+            f"by label counts detections alone: leave by out to search all that {listed(topics)} "
+            "said"
+        )
     if labels > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {labels} labels that were seen most often")
 

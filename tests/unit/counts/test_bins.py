@@ -17,7 +17,7 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, TimeBins, time_bins
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import boolean, detections, odom, text, write_mcap, write_splits
+from tests.support.bags import boolean, detections, log_entry, odom, text, write_mcap, write_splits
 from tests.support.clocks import in_zone
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
@@ -360,6 +360,14 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
     reply = asked(memory, "find_matches", **{**ANY, **given})
     assert reply["error"] == "invalid_arguments"
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
+
+
+def test_counts_of_labels_say_that_they_are_of_detections_alone(tmp_path: Path) -> None:
+    """Else "never" is read of what is said, as of the ids of people who are tracked."""
+    said = [log_entry(BEGIN * S, 20, "tracker", "maria"), odom((BEGIN + 1) * S)]
+    memory = remembered(tmp_path, said)
+    reply = asked(memory, "find_matches", **{**ANY, "topic": "/rosout", "value": "maria"})
+    assert "leave by out to search all that /rosout said" in str(reply["notes"])
 
 
 T = 1_790_000_000
