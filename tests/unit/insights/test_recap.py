@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
@@ -30,6 +31,8 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
+    tf,
+    transform,
     write_mcap,
     write_splits,
 )
@@ -380,6 +383,15 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
         events = asked(memory, "recap", start=T0 + start, end=T0 + 629)["events"]
         *_, stop = (event for event in events if event["text"].startswith("stood at"))
         assert (stop["timestamp"], stop.get("before")) == (T0 + 600, None)
+
+
+def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Path) -> None:
+    """As after a restart, before the initial pose is known."""
+    stood = [odom(at(nth)) for nth in range(60)]
+    placed = [tf(at(nth), transform(at(nth), "map", "odom", (7, 2, 0))) for nth in range(40, 60)]
+    write_mcap(tmp_path / "bag.mcap", sorted([*stood, *placed], key=attrgetter("log_time")))
+    reply = asked(memory_of(tmp_path), "recap", start=at(0) / S, end=at(59) / S)
+    assert [event["text"] for event in reply["events"]] == ["stood at x 7.00, y 2.00"]
 
 
 @pytest.mark.parametrize("moment", [142, 200])
