@@ -149,8 +149,7 @@ def _serve_http(
     Raises:
         CannotListenError: the address cannot be listened on.
     """
-    from ros2_memory.serving.http_run import serve_http
-    from ros2_memory.serving.web_app import web_app
+    from ros2_memory.serving.web_app import serve_http, web_app
 
     app = web_app(
         parts.server,

@@ -23,7 +23,6 @@ from ros2_memory.core.reply import (
     XYZ,
     Absent,
     AnswerWithNotes,
-    JsonObject,
     LocalTimes,
     Scope,
     Unit,
@@ -44,8 +43,6 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
 
 _MINUTE_S: Final = 60
@@ -154,23 +151,15 @@ class TopicRange(AnswerWithNotes):
     fields: tuple[str, ...] = ()
 
     @property
-    def columns(self) -> tuple[str, ...]:
+    def columns(self) -> list[str]:
         """The columns of the table; a field with an object has a column for each of its parts."""
-        columns = ["timestamp", *map(named, self._names())]
-        if any(self._locals()):
-            columns.append("local")
-        return tuple(columns)
+        columns, _ = self._table()
+        return columns
 
     @property
     def rows(self) -> list[JsonValue]:
         """A row for each sample: its time and cells; None in a column that a sample lacks."""
-        names = self._names()
-        rows: list[JsonValue] = []
-        for sample, cells, local in zip(self.samples, self._cells(), self._locals(), strict=True):
-            row = [moment(sample.time), *(quote(cells.get(name), name) for name in names)]
-            if local is not None:
-                row.append(local)
-            rows.append(row)
+        _, rows = self._table()
         return rows
 
     @property
@@ -178,19 +167,24 @@ class TopicRange(AnswerWithNotes):
         """The extremes by field."""
         return [(extremes.field, extremes) for extremes in self.extremes]
 
-    def _locals(self) -> list[str | None]:
-        """Returns the local time of each sample; None if the samples do not span much time."""
+    def _table(self) -> tuple[list[str], list[JsonValue]]:
+        """Returns the names of the columns, and the rows; samples of a long time have `local`."""
         times = LocalTimes(_first_time(self), _last_time(self))
-        return [times.text(sample.time) for sample in self.samples]
-
-    def _names(self) -> Collection[str]:
-        return dict.fromkeys(name for row in self._cells() for name in row).keys()
-
-    def _cells(self) -> list[JsonObject]:
-        return [
-            dict(leaves(sample.value) if isinstance(sample.value, dict) else ())
+        cells = [
+            dict(leaves(sample.value)) if isinstance(sample.value, dict) else {}
             for sample in self.samples
         ]
+        names = dict.fromkeys(name for row in cells for name in row)
+        columns = ["timestamp", *map(named, names)]
+        rows: list[JsonValue] = []
+        for sample, row in zip(self.samples, cells, strict=True):
+            local = times.text(sample.time)
+            shown = [moment(sample.time), *(quote(row.get(name), name) for name in names)]
+            rows.append(shown if local is None else [*shown, local])
+        # All samples have a local time, or none has.
+        if times.text(times.first) is not None:
+            columns.append("local")
+        return columns, rows
 
 
 @result("type", "topics", PAIRS("fields"))

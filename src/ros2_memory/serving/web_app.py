@@ -1,4 +1,4 @@
-"""The web application: `/sse` with `/messages/`, `/mcp`, `/health`, `/metrics` and a page.
+"""The web application, and how it is run: `/sse` with `/messages/`, `/mcp`, `/health` and others.
 
 `/health` is 200 while the server answers; `/health/recording` is 503 unless the recorder records.
 """
@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
 import anyio.to_thread
+import uvicorn
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
+from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.serving.auth import (
     HEALTH_PATH,
     MCP_PATH,
@@ -26,10 +29,16 @@ from ros2_memory.serving.auth import (
     TokenGate,
     access_of,
 )
-from ros2_memory.serving.connection_limits import RequestLimits
+from ros2_memory.serving.connection_limits import (
+    ACCEPTED_AT_ONCE,
+    BoundedConnection,
+    RequestLimits,
+)
+from ros2_memory.serving.listen import BACKLOG, Address, listen
 from ros2_memory.serving.page import Page
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 
     from mcp.server.mcpserver import MCPServer
@@ -40,6 +49,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.telemetry import Exposition
     from ros2_memory.serving.auth import Tokens
+    from ros2_memory.serving.dispatch import Dispatcher
+
+log = get_logger("ros2_memory.server")
 
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
@@ -210,3 +222,67 @@ class McpEndpoint:
         wants_progress = _EVENTS in headers.get("accept", "") and _PROGRESS in body
         app = self._streaming if wants_progress else self._plain
         await app(scope, receive_again, send_with_session)
+
+
+def serve_http(
+    app: ASGIApp,
+    at: Address,
+    dispatcher: Dispatcher,
+    when_listening: Callable[[str], None] | None,
+) -> None:
+    """Serves over HTTP until a signal comes; `when_listening` is called with the site's address.
+
+    Raises:
+        CannotListenError: the address cannot be listened on.
+    """
+    config = uvicorn.Config(
+        app,
+        http=BoundedConnection,
+        backlog=ACCEPTED_AT_ONCE,
+        lifespan="on",
+        ws="none",
+        log_config=None,
+        log_level="warning",
+        # It would show whatever a client puts into a query string.
+        access_log=False,
+        timeout_graceful_shutdown=1,
+    )
+    anyio.run(_Listener(config, dispatcher, when_listening).serve, [listen(at)])
+
+
+class _Listener(uvicorn.Server):
+    """Runs uvicorn, and ends the queries when it stops; event streams end by themselves then."""
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        dispatcher: Dispatcher,
+        when_listening: Callable[[str], None] | None,
+    ) -> None:
+        super().__init__(config)
+        self._dispatcher = dispatcher
+        self._when_listening = when_listening
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listener in sockets or []:
+            # More connections may wait than are accepted at once.
+            listener.listen(BACKLOG)
+            host, port = listener.getsockname()[:2]
+            shown = f"[{host}]" if ":" in host else host
+            site = f"http://{shown}:{port}"
+            log.info(
+                "listening",
+                url=f"{site}{STREAM_PATH}",
+                mcp_url=f"{site}{MCP_PATH}",
+                host=host,
+                port=port,
+            )
+            if self._when_listening is not None:
+                self._when_listening(site)
+        notify(READY)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        notify(STOPPING)
+        self._dispatcher.stop()
+        await super().shutdown(sockets)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import chain
 from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory.bag_dir.layout import is_kept_apart
@@ -16,6 +15,8 @@ from ros2_memory.history.robots import ADVICE, describe_mixed
 from ros2_memory.index.recordings import name_of, recordings_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
@@ -76,26 +77,20 @@ def _memory_of(memory: Memory, name: str) -> Memory:
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
     """Returns the recordings, and the folders that have several; the newest first."""
     by_name = {name_of(path, bags, root): bags for path, bags in recordings_of(snapshot).items()}
-    rows: list[JsonObject] = []
-    bags_by_folder: dict[str, list[list[BagFile]]] = {}
-    for name, bags in by_name.items():
-        rows.append(_row(name, bags))
-        folder = _folder(name)
-        if folder not in by_name:
-            bags_by_folder.setdefault(folder, []).append(bags)
-    for folder, recordings in bags_by_folder.items():
-        if len(recordings) > 1:
-            row = _row(folder, [*chain.from_iterable(recordings)])
-            rows.append({**row, "holds": len(recordings)})
+    by_folder: dict[str, list[str]] = {}
+    for name in by_name:
+        # The folder of the bag directory that has the recording, or the recording itself.
+        folder = name if is_kept_apart(name) else name.partition("/")[0]
+        by_folder.setdefault(folder, []).append(name)
+    rows = [_row(name, bags) for name, bags in by_name.items()]
+    for folder, names in by_folder.items():
+        if len(names) > 1 and folder not in by_name:
+            bags = [bag for name in names for bag in by_name[name]]
+            rows.append({**_row(folder, bags), "holds": len(names)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
 
 
-def _folder(name: str) -> str:
-    """Returns the folder of the bag directory that has a recording, or the recording itself."""
-    return name if is_kept_apart(name) else name.partition("/")[0]
-
-
-def _row(name: str, bags: list[BagFile]) -> JsonObject:
+def _row(name: str, bags: Sequence[BagFile]) -> JsonObject:
     start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
     return {
         "name": name,
