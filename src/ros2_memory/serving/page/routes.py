@@ -23,9 +23,15 @@ from starlette.routing import Route
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
-from ros2_memory.serving.page.moment import moment_shown, sightings_shown, stretch_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
+from ros2_memory.serving.page.span import (
+    LAST_S,
+    SpanRequest,
+    moment_shown,
+    sightings_shown,
+    span_shown,
+    stretch_shown,
+)
 from ros2_memory.serving.page.topics import MOST_SIGNALS, Signal, labels_shown, topics_shown
 
 if TYPE_CHECKING:
