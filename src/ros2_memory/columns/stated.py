@@ -38,7 +38,7 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.columns.detections import Source, detections_in, sources_in
 from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
 from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, within_limits
-from ros2_memory.core.arrays import entries_of_codes
+from ros2_memory.core.arrays import distinct_rows, entries_of_codes
 from ros2_memory.core.text import dotted
 
 if TYPE_CHECKING:
@@ -222,16 +222,17 @@ def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
     _, rows = within_limits(values, entry.level.level, positions, (), surely=True)
     if rows.size and np.bincount(rows).max() > MOST[STATUS]:
         raise UnknownShapeError("more levels than are tracked")
-    keys = np.stack([levels[positions], name.codes[positions], text.codes[positions]])
-    distinct, codes = np.unique(keys, axis=1, return_inverse=True)
+    distinct, codes = distinct_rows(
+        [column[positions] for column in (levels, name.codes, text.codes)]
+    )
     facts = Facts.of(
         [
             (code, fact)
-            for code, (level, who, what) in enumerate(distinct.T.tolist())
+            for code, (level, who, what) in enumerate(distinct.tolist())
             for fact in _facts_of_entry(level, type_name, name.words[who], text.words[what])
         ]
     )
-    counts, taken = entries_of_codes(facts.rows, codes.reshape(-1))
+    counts, taken = entries_of_codes(facts.rows, codes)
     return Facts(np.repeat(rows, counts), facts.codes[taken], facts.values[taken], facts.words)
 
 

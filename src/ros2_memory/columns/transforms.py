@@ -13,9 +13,9 @@ import numpy as np
 
 from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
 from ros2_memory.columns.fragments import FragmentKind
-from ros2_memory.columns.steps import METRES, QUATERNION, Step
+from ros2_memory.columns.pack import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
-from ros2_memory.core.arrays import concatenated
+from ros2_memory.core.arrays import concatenated, distinct_rows
 from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
@@ -191,15 +191,12 @@ def _coded_pairs(transforms: Elements) -> tuple[list[Pair], IntArray]:
     parents, children = transforms.columns[_PARENT], transforms.columns[_CHILD]
     if not isinstance(parents, Texts) or not isinstance(children, Texts):
         return [], np.full(len(transforms), -1)
-    child_count = max(len(children.words), 1)
-    used, codes = np.unique(
-        parents.codes.astype(np.int64) * child_count + children.codes, return_inverse=True
-    )
+    used, codes = distinct_rows((parents.codes, children.codes))
     place_of: dict[Pair, int] = {}
     places: list[int] = []
-    for code in used.tolist():
-        parent = parents.words[code // child_count].removeprefix("/")
-        child = children.words[code % child_count].removeprefix("/")
+    for parent_code, child_code in used.tolist():
+        parent = parents.words[parent_code].removeprefix("/")
+        child = children.words[child_code].removeprefix("/")
         is_edge = bool(child) and parent != child
         places.append(place_of.setdefault((parent, child), len(place_of)) if is_edge else -1)
     return [*place_of], np.array(places, np.int64)[codes]

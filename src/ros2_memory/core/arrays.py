@@ -214,7 +214,7 @@ def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
     return times[order], order, np.split(places, np.cumsum([part.size for part in parts])[:-1])
 
 
-def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
+def distinct_rows(columns: Sequence[Codes]) -> tuple[Ints, Ints]:
     """Returns the distinct rows of a table in ascending order, and the index of each row's."""
     lows = [int(column.min(initial=0)) for column in columns]
     sizes = [
