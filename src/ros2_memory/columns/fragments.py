@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlia
 
 import numpy as np
 
-from ros2_memory.columns.pack import compress, decompress, pack, unpack
-from ros2_memory.columns.steps import EXACT, METRES
+from ros2_memory.columns.pack import EXACT, METRES, compress, decompress, pack, unpack
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:

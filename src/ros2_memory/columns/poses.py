@@ -13,8 +13,8 @@ import numpy as np
 
 from ros2_memory.analysis.frames import unit_quaternions
 from ros2_memory.analysis.poses import FrameCodes, Poses
+from ros2_memory.columns.pack import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.shown import ByType, Listing, Node, Shape, xyzw_of
-from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError
 from ros2_memory.core.arrays import Floats, Vectors, row_sums

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.pack import Packed, compress, pack
-from ros2_memory.columns.steps import step_of
+from ros2_memory.columns.pack import Packed, compress, pack, step_of
 from ros2_memory.columns.stored import Layout, columns_in
 from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.arrays import run_starts

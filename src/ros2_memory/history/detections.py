@@ -14,7 +14,7 @@ from ros2_memory.columns.detections import (
     detections_by,
     joined_detections,
 )
-from ros2_memory.columns.steps import METRES
+from ros2_memory.columns.pack import METRES
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.arrays import begins_of, merged_times
 from ros2_memory.core.model import TimeWindow

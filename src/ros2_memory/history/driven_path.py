@@ -31,9 +31,9 @@ from ros2_memory.analysis.poses import (
     positions_apart,
 )
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
+from ros2_memory.columns.pack import METRES
 from ros2_memory.columns.poses import rounded
 from ros2_memory.columns.scan import STRETCH_NS, Stretch
-from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
+from ros2_memory.columns.pack import METRES
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
-from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.history.no_data import describe_lack

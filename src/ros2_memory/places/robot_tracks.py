@@ -33,7 +33,7 @@ from ros2_memory.analysis.motion.robot_track import (
 )
 from ros2_memory.analysis.poses import Poses, headings, placed_body
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind
-from ros2_memory.columns.steps import QUATERNION
+from ros2_memory.columns.pack import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.arrays import Flags, Ints, stable_order

@@ -32,8 +32,8 @@ from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.bag_dir.state_files import Thinned
+from ros2_memory.columns.pack import Step, step_of
 from ros2_memory.columns.plan import fields_at, is_time
-from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.arrays import numbered, run_starts
 from ros2_memory.core.model import BagState

@@ -13,15 +13,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from ros2_memory.columns.pack import Packed, compress, decompress, pack, unpack
-from ros2_memory.columns.steps import (
+from ros2_memory.columns.pack import (
     DEGREES,
     EXACT,
     METRES,
     MOST_RELATIVE,
     QUATERNION,
     RELATIVE,
+    Packed,
     Step,
+    compress,
+    decompress,
+    pack,
+    unpack,
 )
 from ros2_memory.columns.table import Texts, Zone, may_be_in
 from ros2_memory.columns.zones import Zones
