@@ -8,7 +8,7 @@ limit, and for the ids of goals, which have no columns. Those messages have to b
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -87,10 +87,17 @@ class StatedColumns:
     def of(self, table: Table) -> FromColumns | None:
         """Returns what the messages of a table state; None if all of them have to be read."""
         read = self._readers.of(table)
+        if read is None:
+            return None
         try:
-            return None if read is None else read(Values(table))
+            facts, unsure = read(Values(table))
         except UnknownShapeError:
             return None
+        return FromColumns(Stated(table.log_times, facts), unsure)
+
+
+Reader: TypeAlias = "Callable[[Values], tuple[Facts, IntArray]]"
+"""Reads the facts in the messages of a table, and the rows that its columns do not settle."""
 
 
 class _Entry(NamedTuple):
@@ -101,18 +108,19 @@ class _Entry(NamedTuple):
     text: Leaf
 
 
-def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
-    """Returns the function that reads what messages of a type state.
+def _reader_of(shape: Shape) -> Reader:
+    """Returns what reads the facts in messages of a type, and the rows that columns do not settle.
 
     Raises:
         UnknownShapeError: the columns that say it depend on the message.
     """
     value, type_name = shape.value, shape.type
-    if type_name == GOALS:
-        return _read_goals
+    if type_name == GOALS:  # all messages have to be read: the ids of goals have no columns
+        return lambda values: (NOTHING, np.arange(values.rows))
     if has_errors(type_name):
-        return partial(_read_entries, _entry_leaves(value, type_name), type_name)
-    numbers: Callable[[Values], tuple[Facts, IntArray]] | None = None
+        entry = _entry_leaves(value, type_name)
+        return lambda values: (_entry_facts(values, entry, type_name), _NO_ROWS)
+    numbers: Reader | None = None
     commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
     charges = _leaves_at(value, "percentage") if type_name == BATTERY else []
     if commands:
@@ -123,7 +131,7 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
     if len(flags) > MOST[FLAG]:
         raise UnknownShapeError("more booleans than are tracked")
     sources = sources_in(value) if has_events(type_name) else []
-    return partial(_read_states, sources, flags, numbers)
+    return partial(_state_facts, sources, flags, numbers)
 
 
 # Where a type has what it states
@@ -167,23 +175,13 @@ def _command_leaves(value: Node) -> Iterator[Leaf]:
 # What a table states
 
 
-def _read_goals(values: Values) -> FromColumns:
-    # All messages have to be read: the ids of goals have no columns.
-    return FromColumns(Stated(values.table.log_times), np.arange(values.rows))
-
-
-def _read_entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
-    facts = _entry_facts(values, entry, type_name)
-    return FromColumns(Stated(values.table.log_times, facts), _NO_ROWS)
-
-
-def _read_states(
+def _state_facts(
     sources: Sequence[Source],
     flags: Sequence[tuple[str, Leaf]],
-    numbers: Callable[[Values], tuple[Facts, IntArray]] | None,
+    numbers: Reader | None,
     values: Values,
-) -> FromColumns:
-    """Returns what messages state by their labels, booleans and numbers."""
+) -> tuple[Facts, IntArray]:
+    """Returns what messages state by their labels, booleans and numbers, as a `Reader`."""
     labels: list[Facts] = []
     for source in sources:
         for detections in detections_in(values, source, places=False):
@@ -195,8 +193,7 @@ def _read_states(
         raise UnknownShapeError("more labels than are tracked")
     flag_facts = [_flag_facts(values, path, leaf) for path, leaf in flags]
     number_facts, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
-    facts = joined_facts([label_facts, *flag_facts, number_facts])
-    return FromColumns(Stated(values.table.log_times, facts), unsure)
+    return joined_facts([label_facts, *flag_facts, number_facts]), unsure
 
 
 def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
