@@ -53,8 +53,7 @@ from ros2_memory.messages.detections import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.columns.stored import Topic
-    from ros2_memory.columns.zones import PartZones
+    from ros2_memory.columns.stored import PartZones, Topic
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import IntArray, Mask
 
@@ -596,10 +595,10 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
     order = stable_order(rows)
     return Detections(
         rows[order],
-        joined_texts([part.labels for part in parts]).rows(order),
+        joined_texts([part.labels for part in parts])[order],
         np.concatenate([part.scores for part in parts])[order],
         np.concatenate([part.places for part in parts])[order],
-        joined_texts([part.frames for part in parts]).rows(order),
+        joined_texts([part.frames for part in parts])[order],
     )
 
 

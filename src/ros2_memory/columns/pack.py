@@ -514,7 +514,7 @@ def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
 def _pack_texts(column: Texts) -> Packed:
     if not np.bincount(column.codes, minlength=len(column.words)).all():
         # Words of deleted rows must not stay in the file.
-        column = column.rows(np.arange(len(column)))
+        column = column[np.arange(len(column))]
     codes, words = column.codes, column.words
     zone = Zone(words=zone_words(words))
     if not words:

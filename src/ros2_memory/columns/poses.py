@@ -238,7 +238,7 @@ class _RoundedRows:
         column = self._table.columns.get(path)
         if not isinstance(column, Texts):
             raise UnknownShapeError(f"{path} has no column")
-        return column if self._index is None else column.rows(self._index)
+        return column if self._index is None else column[self._index]
 
 
 def rounded(values: NDArray[np.float64], step: Step) -> NDArray[np.float64]:

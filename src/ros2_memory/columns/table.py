@@ -155,7 +155,7 @@ class Texts:
         """Returns some rows, with all words."""
         return Texts(self.codes[positions], self.words)
 
-    def rows(self, positions: IntArray) -> Texts:
+    def __getitem__(self, positions: IntArray) -> Texts:
         """Returns some rows, without the words that none of them has."""
         codes = self.codes[positions]
         if len(self.words) <= 1:
@@ -199,7 +199,7 @@ class Elements:
         counts, taken = entries_of_codes(self.owners, positions)
         return Elements(
             range_numbers(counts),
-            {path: _rows_of(column, taken) for path, column in self.columns.items()},
+            {path: column[taken] for path, column in self.columns.items()},
             {path: inner.rows(taken) for path, inner in self.elements.items()},
         )
 
@@ -282,7 +282,7 @@ class Table:
             log_times=self.log_times[positions],
             publish_times=self.publish_times[positions],
             places=self.places[positions],
-            columns={path: _rows_of(column, positions) for path, column in self.columns.items()},
+            columns={path: column[positions] for path, column in self.columns.items()},
             elements={path: inner.rows(positions) for path, inner in self.elements.items()},
             payload_hashes=None if hashes is None else hashes[positions],
             bags=None if bags is None else bags[positions],
@@ -338,10 +338,6 @@ def join_tables(tables: Sequence[Table]) -> Table:
 def _hashes(table: Table) -> IntArray:
     hashes = table.payload_hashes
     return np.full(len(table), UNHASHED) if hashes is None else hashes
-
-
-def _rows_of(column: Column, positions: IntArray) -> Column:
-    return column.rows(positions) if isinstance(column, Texts) else column[positions]
 
 
 def joined_column(parts: Sequence[Column]) -> Column:

@@ -83,7 +83,7 @@ class Detected(NamedTuple):
             self.log_times[new],
             self.stamps[new],
             self.found.at(new),
-            self.frames.rows(new),
+            self.frames[new],
         )
 
 
@@ -97,7 +97,7 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
         for place, part in zip(places, parts, strict=True)
     ]
     stamps = np.concatenate([part.stamps for part in parts])[order]
-    frames = joined_texts([part.frames for part in parts]).rows(order)
+    frames = joined_texts([part.frames for part in parts])[order]
     return Detected(log_times, stamps, joined_detections(detections), frames)
 
 
@@ -142,7 +142,7 @@ class DetectionRows:
             return None
         detections, stamps, frames = columns
         if rows.index is not None:
-            detections, frames = detections.at(rows.index), frames.rows(rows.index)
+            detections, frames = detections.at(rows.index), frames[rows.index]
             stamps = None if stamps is None else stamps[rows.index]
         stamps = rows.times if stamps is None else stamps
         return Detected(rows.times, stamps, detections, frames)

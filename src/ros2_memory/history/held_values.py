@@ -271,7 +271,7 @@ class HeldValues:
         if not times.size:
             return []
         order = np.argsort(times, kind="stable")
-        texts = joined_texts([part_texts for _, part_texts in parts]).rows(order)
+        texts = joined_texts([part_texts for _, part_texts in parts])[order]
         times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
         breaks |= np.diff(np.searchsorted(self._breaks, times)) > 0
@@ -294,7 +294,7 @@ class HeldValues:
         words = words_of(rows.table, self._field, self._view.extractor)
         if words is None:
             return None
-        return rows.times, words if rows.index is None else words.rows(rows.index)
+        return rows.times, words if rows.index is None else words[rows.index]
 
     def _runs_of_messages(
         self, block: Sequence[Rows], window: TimeWindow, *, newest_first: bool
