@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.store import PartHead
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.index.segment import TopicExtent
     from ros2_memory.index.timeline import Timeline
 

@@ -17,11 +17,17 @@ from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
 from ros2_memory.columns.pack import Packed, decompress, is_large, unpack
-from ros2_memory.columns.stored import OUTLINE, StoredTable, lazy_columns, outline_of
+from ros2_memory.columns.stored import (
+    OUTLINE,
+    PartZones,
+    StoredTable,
+    Zones,
+    lazy_columns,
+    outline_of,
+)
 from ros2_memory.columns.table import Column, Table, Texts, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.writing import BAG, LOG_TIME
-from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Ns

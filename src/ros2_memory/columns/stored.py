@@ -2,6 +2,8 @@
 
 A topic has the same columns from bag to bag, so their layout is stored once.
 
+The zones of a column over many parts are arrays: one comparison rules out a week of them.
+
 The outline of a part says what its zones do not, without a column being unpacked: how many numbers
 a column has, their sum, and the times of the least and the greatest one; and which runs of letters
 are in which text, if a column has too many texts for its zone (JSON, lines of a log). It is made
@@ -11,7 +13,9 @@ while the store is filled, and remains when columns are dropped.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping
+import math
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar, cast
@@ -27,10 +31,12 @@ from ros2_memory.columns.table import (
     Table,
     Texts,
     Zone,
+    as_float,
     letters_of,
+    may_be_in,
     words_of,
 )
-from ros2_memory.core.arrays import Flags, numbered
+from ros2_memory.core.arrays import Flags, numbered, places_among
 from ros2_memory.core.text import caseless
 
 if TYPE_CHECKING:
@@ -50,6 +56,9 @@ _TOTALS_BYTES: Final = 600
 """About how much memory the totals of a column take."""
 _MOST_LETTERS: Final = 1_024
 """Distinct runs of letters in the texts of a part; if there are more, the outline has none."""
+_EXACT_BELOW: Final = 2.0**53
+_ANY: Final = -1
+"""The code of a zone whose words are not known."""
 V = TypeVar("V")
 
 
@@ -247,6 +256,134 @@ def lazy_columns(
     kept = {name: path for name, path in columns.items() if path not in dropped}
     lists = {name: path for name, path in sequences.items() if f"{path}#" not in dropped}
     return LazyMapping(kept, lambda name: column(kept[name])), LazyMapping(lists, elements)
+
+
+# What is known of columns without unpacking them
+
+
+class Zones(NamedTuple):
+    """The zones of one column in several parts.
+
+    Attributes:
+        parts: the numbers of the parts, ascending.
+        low: a bound that no value of the part is below; infinity if it has none.
+        high: a bound that no value of the part is above; minus infinity if it has none.
+        codes: the place in `words` of the part's words; -1 if any text may be there.
+        words: the distinct `Zone.words` of the parts.
+    """
+
+    parts: IntArray
+    low: Floats
+    high: Floats
+    codes: IntArray
+    words: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, parts: Sequence[int], zones: Sequence[Zone]) -> Zones:
+        """Returns the zones of parts, whose numbers ascend."""
+        code_of: dict[str, int] = {}
+        codes = [
+            _ANY if zone.words is None else code_of.setdefault(zone.words, len(code_of))
+            for zone in zones
+        ]
+        return cls(
+            np.array(parts, np.int64),
+            _bounds([zone.low for zone in zones], -math.inf),
+            _bounds([zone.high for zone in zones], math.inf),
+            np.array(codes, np.int64),
+            tuple(code_of),
+        )
+
+    def among(self, parts: IntArray) -> Zones:
+        """Returns the zones of some parts, in their order; unknown ones may have any value."""
+        places, is_known = places_among(parts, self.parts)
+        at = np.where(is_known, places, -1)
+        return Zones(
+            parts,
+            np.append(self.low, -math.inf)[at],
+            np.append(self.high, math.inf)[at],
+            np.append(self.codes, _ANY)[at],
+            self.words,
+        )
+
+    def joined(self, newer: Zones) -> Zones:
+        """Returns these zones and those of newer parts."""
+        code_of = {words: code for code, words in enumerate(self.words)}
+        newer_codes = [code_of.setdefault(words, len(code_of)) for words in newer.words]
+        recoded = np.array([*newer_codes, _ANY], np.int64)  # at the end, so for code -1: -1
+        return Zones(
+            np.concatenate((self.parts, newer.parts)),
+            np.concatenate((self.low, newer.low)),
+            np.concatenate((self.high, newer.high)),
+            np.concatenate((self.codes, recoded[newer.codes])),
+            tuple(code_of),
+        )
+
+    def divided(self, by: int) -> Zones:
+        """Returns the zones of the values divided by a positive number."""
+        return self._replace(low=self.low / by, high=self.high / by)
+
+    def spans(self, number: float) -> Flags:
+        """Returns which parts may have a number as a value."""
+        at = as_float(number)
+        return (self.low <= at) & (at <= self.high)
+
+    def reaches(self, limit: float, *, above: bool) -> Flags:
+        """Returns which parts may have a value above a limit, or else below it."""
+        # An integer that no float reaches is below infinity all the same.
+        at = min(max(as_float(limit), -sys.float_info.max), sys.float_info.max)
+        return self.high > at if above else self.low < at
+
+    def may_be_near(self, place: float, distance: float) -> Flags:
+        """Returns which parts may have a value within a distance of a place."""
+        return (self.low - place <= distance) & (place - self.high <= distance)
+
+    def may_have(self, text: str) -> Flags:
+        """Returns which parts may have a value that contains a casefolded text."""
+        return self._where(lambda words: may_be_in(words, text))
+
+    @property
+    def may_be_json(self) -> Flags:
+        """Which parts may have a text that is a JSON array or object."""
+        return self._where(lambda words: may_be_in(words, "[") or may_be_in(words, "{"))
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 32 * self.parts.size + sum(60 + len(words) for words in self.words)
+
+    def _where(self, may_have: Callable[[str], bool]) -> Flags:
+        """Returns which parts have words of which `may_have` is true, or unknown words."""
+        flags = np.ones(len(self.words) + 1, np.bool_)
+        for code in np.unique(self.codes[self.codes != _ANY]).tolist():
+            flags[code] = may_have(self.words[code])
+        return flags[self.codes]
+
+
+class PartZones(NamedTuple):
+    """Some parts of one topic, of which only zones are read.
+
+    Attributes:
+        topic: the topic.
+        numbers: of the parts.
+        zones: returns the zones of a column by its path.
+    """
+
+    topic: Topic
+    numbers: IntArray
+    zones: Callable[[str], Zones]
+
+    def zone(self, path: str) -> Zones:
+        """Returns the zones of a column; of elements its path is `<sequence>.<column>`."""
+        return self.zones(path.rstrip("."))
+
+
+def _bounds(values: Sequence[float], away: float) -> Floats:
+    """Returns bounds as floats; those that are rounded are moved one float farther away."""
+    bounds = np.array([float(value) for value in values], np.float64)
+    is_rounded = (np.abs(bounds) >= _EXACT_BELOW) & np.isfinite(bounds)
+    with np.errstate(over="ignore"):  # beyond the greatest float lies infinity
+        return np.where(is_rounded, np.nextafter(bounds, away), bounds)
 
 
 class Totals(NamedTuple):

@@ -49,9 +49,9 @@ from ros2_memory.messages.detections import without_low_scores
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Numeric, ZonesOf
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import Mask
 

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 import numpy as np
 
 from ros2_memory.analysis.frames import unit_quaternions
-from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.stored import StoredTable, Zones
 from ros2_memory.columns.table import IN_PART, MAX_NUMBERS, Column, Elements, Table, Texts, Zone
-from ros2_memory.columns.zones import Zones
 from ros2_memory.core.arrays import Floats, row_sums
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.frames import Edges
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.timebase import Ns, Span
     from ros2_memory.history.view import View

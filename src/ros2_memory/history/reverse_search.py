@@ -38,8 +38,8 @@ from ros2_memory.history.tested_messages import RowCondition
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray, Mask

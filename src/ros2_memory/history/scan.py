@@ -27,8 +27,8 @@ from ros2_memory.messages.to_json import evenly
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.arrays import Ints
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View

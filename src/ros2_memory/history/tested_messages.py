@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View

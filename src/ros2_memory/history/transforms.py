@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.units import Rows
-    from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Mask

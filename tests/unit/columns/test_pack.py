@@ -27,8 +27,8 @@ from ros2_memory.columns.pack import (
     pack,
     unpack,
 )
+from ros2_memory.columns.stored import Zones
 from ros2_memory.columns.table import Texts, Zone, may_be_in
-from ros2_memory.columns.zones import Zones
 from tests.support.examples import examples
 
 Values = NDArray[Any]

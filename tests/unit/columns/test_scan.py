@@ -16,10 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.fill import StoreLimits
-from ros2_memory.columns.stored import Letters
+from ros2_memory.columns.stored import Letters, PartZones
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import GoneError
-from ros2_memory.columns.zones import PartZones
 from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan

@@ -16,11 +16,10 @@ from ros2_memory.columns.detections import DetectionColumns, Detections, detecti
 from ros2_memory.columns.poses import NoPoseError, PoseColumns
 from ros2_memory.columns.shown import numbers
 from ros2_memory.columns.stated import StatedColumns
-from ros2_memory.columns.stored import Layout, Topic
+from ros2_memory.columns.stored import Layout, PartZones, Topic, Zones
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import seconds
-from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
