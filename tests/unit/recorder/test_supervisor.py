@@ -27,6 +27,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.policies import ClockReading, SilenceWatch, set_back
+from ros2_memory.recorder.process import topics
 from ros2_memory.recorder.reception import Reception
 from ros2_memory.recorder.sessions import Required
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -712,3 +713,19 @@ def test_a_step_runs_in_the_background_and_its_fault_is_reported(tmp_path: Path)
     assert "screened.json" in background.faults()["screen"]
     house.finish()
     assert "screened.json" in background.faults()["screen"]
+
+
+def test_the_pattern_of_a_list_of_topics_is_made_once_and_not_with_each_tick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, pattern = list[str](), topics._pattern
+
+    def noted(entry: str) -> str:
+        made.append(entry)
+        return pattern(entry)
+
+    monkeypatch.setattr(topics, "_pattern", noted)
+    World(tmp_path / "bags", expected=[f"/part_{number}/state" for number in range(50)]).started(
+        100
+    )
+    assert len(made) == len({*made})

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import yaml
@@ -38,14 +39,17 @@ SERVICE_EVENT: Final = "/_service_event"
 _NAME: Final = re.compile(r"(/(?!\d)(\w|\*(?!\*))+)+", re.ASCII)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TopicSelection:
-    """The entries of `topics.yaml`, each once, in the order of the file."""
+    """The entries of `topics.yaml`, each once, in the order of the file.
+
+    It is asked for its names several times a second.
+    """
 
     entries: tuple[str, ...]
     excluded: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def exact(self) -> tuple[str, ...]:
         """The entries that are names, not globs, and are recorded."""
         return tuple(entry for entry in self.entries if "*" not in entry and self.matches(entry))
@@ -65,7 +69,7 @@ class TopicSelection:
         """The entries that are events of services."""
         return tuple(entry for entry in self.entries if entry.endswith(SERVICE_EVENT))
 
-    @property
+    @cached_property
     def regex(self) -> str:
         """An anchored ECMAScript (and Python) regular expression that matches only these topics.
 
