@@ -28,7 +28,6 @@ import errno
 import json
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 from zlib import crc32
 
@@ -138,13 +137,13 @@ class Handover:
         """Whether no message of the recording counts except those in `also_counts`."""
         return self.state is not Counting.COUNTS
 
-    def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
-        """Returns what the two cuts exclude of one bag file; they do not matter if `hides_all`."""
+    def rule(self, file_name: str) -> FileRule | None:
+        """Returns which messages of one bag file count; None if all do, as in most files."""
         sides = (
             (self.begin, MIN_NS, self.counts_from),
             (self.end, self.counts_until, MAX_NS),
         )
-        exclusions: list[Exclusion] = []
+        exclusions = [_EVERYTHING] if self.hides_all else []
         for overlap, start, stop in sides:
             if overlap and start is not None and stop is not None and file_name in overlap.files:
                 logged = TimeWindow(
@@ -152,16 +151,16 @@ class Handover:
                     MAX_NS if overlap.log_until is None else overlap.log_until,
                 )
                 exclusions.append(Exclusion(TimeWindow(start, stop), logged))
-        return tuple(exclusions)
-
-    def rule(self, file_name: str) -> FileRule | None:
-        """Returns which messages of one bag file count; None if all do, as in most files."""
-        exclusions = (_EVERYTHING,) if self.hides_all else self.exclusions(file_name)
-        also = self.also_counts.get(file_name, {})
-        elsewhere = self.counts_elsewhere.get(file_name, {})
+        elsewhere = _listed_in(self.counts_elsewhere, file_name)
         if not (exclusions or elsewhere):
             return None
-        return FileRule(exclusions, also, elsewhere, hides_latched=self.hides_all)
+        also = _listed_in(self.also_counts, file_name)
+        return FileRule(tuple(exclusions), also, elsewhere, hides_latched=self.hides_all)
+
+
+def _listed_in(messages: MessageList, file_name: str) -> dict[str, frozenset[str]]:
+    """Returns the listed messages of one bag file by topic."""
+    return {topic: frozenset(ids) for topic, ids in messages.get(file_name, {}).items()}
 
 
 _HANDOVER: Final = TypeAdapter(Handover)
@@ -190,11 +189,6 @@ def message_id(publish_time: Ns, payload: bytes) -> str:
     return f"{publish_time} {crc32(payload):08x}"
 
 
-@lru_cache(maxsize=256)
-def _as_set(listed: tuple[str, ...]) -> frozenset[str]:
-    return frozenset(listed)
-
-
 class FileRule(NamedTuple):
     """Which messages of one bag file count.
 
@@ -206,8 +200,8 @@ class FileRule(NamedTuple):
     """
 
     exclusions: tuple[Exclusion, ...]
-    also: Mapping[str, tuple[str, ...]]
-    elsewhere: Mapping[str, tuple[str, ...]]
+    also: Mapping[str, frozenset[str]]
+    elsewhere: Mapping[str, frozenset[str]]
     hides_latched: bool
 
     @property
@@ -225,7 +219,7 @@ class FileRule(NamedTuple):
         listed = (self.also if is_excluded else self.elsewhere).get(channel.topic)
         if not listed:
             return not is_excluded
-        is_listed = message_id(record.publish_time, record.payload) in _as_set(listed)
+        is_listed = message_id(record.publish_time, record.payload) in listed
         return is_listed == is_excluded
 
     def touches(self, window: TimeWindow, topics: Collection[str]) -> bool:
