@@ -66,6 +66,7 @@ from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay, most
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import (
+    crowded_notes,
     describe_hung,
     look_alike_notes,
     note_undecoded,
@@ -275,6 +276,7 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
         )
     windows = earlier, later
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, windows))
+    view.notes.add(*crowded_notes(things))
     places = places_asked(limits, where, things.frames)
     between = _ThingsBetween(things, earlier, later, where, places)
     compared, moves = between.compare()

@@ -37,7 +37,7 @@ from ros2_memory.things.instances import (
     count_names,
 )
 from ros2_memory.things.labels import Labels, moves_by_itself
-from ros2_memory.things.places import GATE_MM, MIDDLE, places_of, stays_in
+from ros2_memory.things.places import GATE_MM, MAX_PLACES, MIDDLE, places_of, stays_in
 from ros2_memory.things.presence import Evidence, evidence_at, stays_at
 from ros2_memory.things.stays import (
     FEWEST,
@@ -112,6 +112,7 @@ def estimate(
         names=names,
         evidence=_evidence_of(instances, groups),
         unplaced_of={group.key: group.unplaced for group in groups},
+        crowded=frozenset(names[group.key] for group in groups if group.is_crowded),
     )
     for instance in instances:
         instance.looks, instance.missed_by = result.missing(instance, instance.stays[-1])
@@ -133,6 +134,7 @@ def _linked_things(
     instances: list[Instance] = []
     movers: list[Mover] = []
     for group in groups:
+        observed.go_on()
         linked = _link(group, observed)
         _add_poorly_localised(linked, group, observed)
         moves = len(group.stays) - len(linked)
@@ -194,6 +196,7 @@ def _places_of_group(group: LabelGroup, observed: Observations) -> Iterator[tupl
     floors = np.split(by_height, np.flatnonzero(np.diff(z[by_height]) > STOREY_MM) + 1)
     for floor in floors:
         on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
+        group.is_crowded |= int(on_floor.max(initial=-1)) + 1 == MAX_PLACES
         place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
     of_message = (spots[rows, name] for name in (Spot.SLICE, Spot.TOPIC, Spot.LABEL))

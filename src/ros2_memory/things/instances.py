@@ -192,6 +192,8 @@ class Estimate:
     """By key, epoch and place: the evidence for the places of things."""
     unplaced_of: dict[str, Ints]
     """The rows of `unplaced` of each key."""
+    crowded: frozenset[str]
+    """The names of what is at so many places that some are left out."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
     """For each spot, the number of the first stay that has it; -1 for none."""

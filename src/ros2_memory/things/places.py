@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from itertools import pairwise, product
+from itertools import chain, islice, pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -59,7 +59,8 @@ MIDDLE: Final = (10, 90)
 _SCATTER_MM: Final = 800
 _FEW: Final = 25.0
 """Fewer detections from far away may scatter over `_SCATTER_MM`."""
-_MAX_PLACES: Final = 512
+MAX_PLACES: Final = 2048
+"""The most places of a label: stays are linked with each other, which takes the square of it."""
 _FULL_WEIGHT: Final = 10
 """A spot of more detections weighs no more: all of one slice share its error of localisation."""
 
@@ -67,20 +68,39 @@ _FULL_WEIGHT: Final = 10
 def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
     """Returns the number of each spot's place, or -1, for spots (mm) of one label.
 
-    `n` has the detections of each spot, `slices` its slice.
+    There are at most `MAX_PLACES`. `n` has the detections of each spot, `slices` its slice.
     """
     weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
-    centre = np.stack([np.bincount(cell_of, weight * axis) / mass for axis in (x, y)], axis=1)
+    centre = np.stack([np.bincount(cell_of, weight * axis) / mass for axis in (x, y)])
     order = stable_order(-_density(cells, mass))
     spots = _Spots(stable_order(order)[cell_of], weight, slices)
-    peaks = _peaks(centre[order], mass[order], spots)
-    if not len(peaks):
-        return np.full(len(x), -1, np.int64)
-    place, away_squared = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
-    place[away_squared > GATE_MM**2] = -1
+    place, least = np.full(len(x), -1, np.int64), np.full(len(x), np.inf)
+    points = _Points(x, y)
+    peaks = _peaks(centre[:, order], mass[order], spots)
+    for number, peak in enumerate(islice(peaks, MAX_PLACES)):
+        near, squared = points.near(peak.x, peak.y, GATE_MM)
+        is_nearest = squared < least[near]
+        near = near[is_nearest]
+        place[near], least[near] = number, squared[is_nearest]
     return place
+
+
+class _Points:
+    """Points of the plane (mm) by their x, so that few are compared: a hall has many places."""
+
+    def __init__(self, x: Ints | Floats, y: Ints | Floats) -> None:
+        self._order = stable_order(x)
+        self._x, self._y = x[self._order], y[self._order]
+
+    def near(self, x: float, y: float, reach_mm: float) -> tuple[Ints, Floats]:
+        """Returns the points within a distance of another one, and their squared distances."""
+        beside = slice(*np.searchsorted(self._x, (x - reach_mm, x + reach_mm + 1)).tolist())
+        dx, dy = self._x[beside] - x, self._y[beside] - y
+        squared = dx * dx + dy * dy
+        is_near = squared <= reach_mm**2
+        return self._order[beside][is_near], squared[is_near]
 
 
 class _Spots(NamedTuple):
@@ -90,57 +110,58 @@ class _Spots(NamedTuple):
     weight: Floats
     slice: Ints
 
-    def share(self, cells: Flags, others: Flags) -> float:
+    def share(self, cells: Ints, others: Ints) -> float:
         """Returns the weight in cells over that in others, while most of the former is seen."""
-        is_inside = cells[self.cell]
+        is_inside = np.isin(self.cell, cells)
         first, last = np.percentile(self.slice[is_inside], MIDDLE)
         weight = self.weight * ((self.slice >= first) & (self.slice <= last))
-        return float(weight[is_inside].sum() / max(weight[others[self.cell]].sum(), 1.0))
+        weight_of_others = weight[np.isin(self.cell, others)].sum()
+        return float(weight[is_inside].sum() / max(weight_of_others, 1.0))
 
 
-def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
-    """Returns the peaks of density, the densest first, at least `_CLAIM_MM` apart.
+class _Peak(NamedTuple):
+    """A peak of density (mm), and the mass of the cells that it claims."""
+
+    x: float
+    y: float
+    mass: float
+
+    def may_be_noise_of(self, other: _Peak) -> bool:
+        """Returns whether another peak is so near, and so much heavier, or both are so light."""
+        away_mm = math.dist(self[:2], other[:2])
+        is_halo = away_mm <= GATE_MM and other.mass > self.mass / _HALO_SHARE
+        return is_halo or (away_mm <= _SCATTER_MM and other.mass + self.mass < _FEW)
+
+
+def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Iterator[_Peak]:
+    """Yields the peaks of density, the densest first, at least `_CLAIM_MM` apart.
 
     `centre` and `mass` are of cells, the densest first.
     """
-    x, y = centre.T.copy()
-    is_free = np.ones(len(mass), bool)
-    peaks, masses = np.empty((2, _MAX_PLACES)), np.empty(_MAX_PLACES)
-    count = 0
+    points, is_free = _Points(*centre), np.ones(len(mass), np.bool_)
+    by_tile: dict[tuple[int, int], list[_Peak]] = {}
     for cell in range(len(mass)):
         if not is_free[cell]:
             continue
-        near = is_free & (_squared(x - x[cell], y - y[cell]) <= _PEAK_MM**2)
-        weights = mass * near
-        peak = np.array((weights @ x, weights @ y)) / weights.sum()
-        is_claimed = is_free & (_squared(x - peak[0], y - peak[1]) <= _CLAIM_MM**2)
-        is_claimed[cell] = True
-        weight = float(mass @ is_claimed)
-        is_free &= ~is_claimed
-        hosts = _heavier_peaks(peak, weight, peaks[:, :count], masses[:count])
-        is_noise = bool(hosts) and weight < _FEW
-        for host_x, host_y in hosts:
-            if is_noise:
-                break
-            is_of_host = _squared(x - host_x, y - host_y) <= _CLAIM_MM**2
-            is_noise = spots.share(is_claimed, is_of_host) <= _OWN_SHARE
-        if is_noise:
+        at_x, at_y = centre[:, cell].tolist()
+        around, _ = points.near(at_x, at_y, _PEAK_MM)
+        around = around[is_free[around]]
+        x, y = np.average(centre[:, around], axis=1, weights=mass[around]).tolist()
+        claimed, _ = points.near(x, y, _CLAIM_MM)
+        claimed = claimed[is_free[claimed]]
+        is_free[claimed] = False
+        peak = _Peak(x, y, float(mass[claimed].sum()))
+        column, row = int(x // GATE_MM), int(y // GATE_MM)
+        tiles = product((column - 1, column, column + 1), (row - 1, row, row + 1))
+        beside = chain.from_iterable(by_tile.get(tile, ()) for tile in tiles)
+        hosts = [other for other in beside if peak.may_be_noise_of(other)]
+        of_hosts = (points.near(host.x, host.y, _CLAIM_MM)[0] for host in hosts)
+        if hosts and peak.mass < _FEW:
             continue
-        peaks[:, count], masses[count] = peak, weight
-        count += 1
-        if count == _MAX_PLACES:
-            break
-    return peaks[:, :count].T
-
-
-def _heavier_peaks(
-    peak: Floats, weight: float, peaks: Floats, masses: Floats
-) -> list[tuple[float, float]]:
-    """Returns the peaks near a light one that are so heavy that it may be their noise."""
-    away = _squared(peaks[0] - peak[0], peaks[1] - peak[1])
-    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
-    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    return [(x, y) for x, y in peaks.T[is_halo | is_scatter].tolist()]
+        if any(spots.share(claimed, of_host) <= _OWN_SHARE for of_host in of_hosts):
+            continue
+        by_tile.setdefault((column, row), []).append(peak)
+        yield peak
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:
@@ -155,21 +176,6 @@ def _density(cells: Ints, mass: Floats) -> Floats:
     # Whole numbers, whose sums do not depend on their order.
     density: Floats = np.where(is_there, np.append(mass, 0.0)[row], 0.0).sum(axis=0)
     return density
-
-
-def _squared(dx: Floats, dy: Floats) -> Floats:
-    return dx * dx + dy * dy  # several times as fast as `numpy.hypot`
-
-
-def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
-    """Returns the nearest peak of each point, and its squared distance (mm²)."""
-    x, y = points.T.copy()
-    nearest, least = np.zeros(len(x), np.int64), np.full(len(x), np.inf)
-    for number, (peak_x, peak_y) in enumerate(peaks.tolist()):
-        away = _squared(x - peak_x, y - peak_y)
-        np.copyto(nearest, number, where=away < least)
-        np.minimum(least, away, out=least)
-    return nearest, least
 
 
 _PAUSE_NS: Final = 60 * NS_PER_S

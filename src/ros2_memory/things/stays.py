@@ -86,6 +86,7 @@ class LabelGroup:
         carried: the spots seen while the robot carried the thing.
         unplaced: rows of `Sights.unplaced` with the label, in all epochs.
         places: the spots at each place.
+        is_crowded: whether other places are left out, since there are too many.
     """
 
     key: str
@@ -96,6 +97,7 @@ class LabelGroup:
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
     evidence: Evidence = field(init=False)
+    is_crowded: bool = False
 
 
 class Observations:

@@ -51,6 +51,7 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import last_word, plain, singular
+from ros2_memory.things.places import MAX_PLACES
 from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
@@ -329,6 +330,7 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
             f"fields {', '.join(LABELS)}, as in vision_msgs/msg/Detection3DArray; find_matches "
             "searches text"
         )
+    yield from crowded_notes(known)
     yield from vague_notes(known, (question.window,), question.labels, question.vague)
     if not question.labels:
         yield from unplaced_notes(known, (question.window,))
@@ -388,6 +390,17 @@ def vague_notes(
             "localisation was poor when these were detected last, which moves nothing, so that "
             f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
             labels,
+        )
+
+
+def crowded_notes(known: KnownThings) -> Iterator[str]:
+    """Yields the labels of which things are left out, since there are too many."""
+    crowded = sorted(known.estimate.crowded)
+    if crowded:
+        yield repeating(
+            f"of more than {MAX_PLACES} places of one label, the others are left out: "
+            f"{listed(crowded, at_most=_MOST_NAMED)}",
+            crowded,
         )
 
 

@@ -26,7 +26,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
-from ros2_memory.things import known, synonyms, unseen
+from ros2_memory.things import estimation, known, places, synonyms, unseen
 from ros2_memory.things.find import find_things
 from ros2_memory.things.places import places_of
 from tests.support.bags import Msg, detected, header, make, odom, text, tf, transform, write_splits
@@ -354,6 +354,24 @@ def test_all_chairs_of_a_hall_are_counted_or_it_is_said_that_some_are_not(
     reply = told_of(tmp_path, looked(0, 5, HERE, *hall), limit=100)
     assert reply["total"] == min(chairs, 128)
     assert sum("of more than 128 at once" in each for each in reply.get("notes", ())) == notes
+
+
+@pytest.mark.parametrize("most", [2048, 512])
+def test_all_pallets_of_a_warehouse_are_counted_or_it_is_said_that_some_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """There are 600, ten in view at a time. With a limit below, as it was, the total is of 512."""
+    for module in (places, estimation, unseen):
+        monkeypatch.setattr(module, "MAX_PLACES", most)
+    messages: list[Msg] = []
+    for row in range(60):
+        pallets = [("pallet", 1.5 * x, 1.5 * row) for x in range(10)]
+        robot = (6.75, 1.5 * row - 3.0, math.pi / 2)
+        messages += looked(10 * row, 10 * row + 4, robot, *pallets)
+    found = told_of(tmp_path, messages, label="pallet")
+    is_said = f"of more than {most} places of one label, the others are left out: pallet"
+    assert found["total"] == min(600, most)
+    assert (is_said in found.get("notes", ())) == (most < 600)
 
 
 def test_of_too_many_labels_at_once_it_is_said_that_some_are_left_out(
