@@ -509,17 +509,14 @@ class _ConditionStates:
         self._times, self._met = times, met
         self._read = TimeWindow(start, stop)
 
-    def _blocks(self, topic: str, window: TimeWindow) -> Iterator[Tested]:
-        return (block.tested() for block in self._tester.newest_first(topic, window))
-
     def _tested(self, window: TimeWindow) -> tuple[list[Ns], list[bool]]:
         """Returns the log times of the messages in a window, in order, and whether each met it."""
         # Of messages with one log time those of the last topic are the newest.
-        parts = [
-            replace(tested, sources=tested.sources + (nth << 32))
-            for nth, topic in enumerate(self.search.topics)
-            for tested in self._blocks(topic, window)
-        ]
+        parts: list[Tested] = []
+        for nth, topic in enumerate(self.search.topics):
+            for block in self._tester.newest_first(topic, window):
+                tested = block.tested()
+                parts.append(replace(tested, sources=tested.sources + (nth << 32)))
         if not parts:
             return [], []
         tested = stacked(parts)
