@@ -37,15 +37,13 @@ from ros2_memory.things.instances import (
     count_names,
 )
 from ros2_memory.things.labels import Labels, moves_by_itself
+from ros2_memory.things.observations import FEWEST, Observations, lowest_bin
 from ros2_memory.things.places import GATE_MM, MAX_PLACES, MIDDLE, places_of, stays_in
 from ros2_memory.things.presence import Evidence, evidence_at, stays_at
 from ros2_memory.things.stays import (
-    FEWEST,
     LabelGroup,
-    Observations,
     end_where_carried_away,
     groups_in,
-    lowest_bin,
     placed_stays,
     remove_false_stays,
 )

@@ -8,10 +8,6 @@ Where a thing was moved a little (`stays_in`): a sighting is where something was
 the mean of some looks. It has three errors: the noise of each look; the error of localisation that
 all looks of a *visit* share; and a bias along the view of the detector. A regression of all visits
 on the side of the view and on a step says how large the step is, and how exactly that is known.
-
-When localisation was poor (`poorly_localised`): then a detection is not where it seems to be.
-Localisation is poor while the localiser's covariance is large, and for some seconds before the map
-jumps under odometry, which shows that it had been off.
 """
 
 from __future__ import annotations
@@ -24,7 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
-from ros2_memory.analysis.sights import Fix, Look, Spot
+from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
@@ -40,8 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.sights import Floats
-    from ros2_memory.columns.sights import JoinedSights
-    from ros2_memory.core.arrays import Columns
 
 _CELL_MM: Final = 100
 _PEAK_MM: Final = 300
@@ -396,48 +390,3 @@ def _before_and_after(
     old = until[..., visit] - until[..., first[thing]] + _normal_equations(here - begin, own)
     new = until[..., stop[thing]] - until[..., visit + 1] + _normal_equations(end - here, own)
     return old, new
-
-
-_POOR_MM: Final = 600
-"""Standard deviation of a point `AHEAD_MM` before the robot, above which localisation is poor."""
-_JUMP_MM: Final = 300.0
-"""A jump moves that point by more in the map, without odometry."""
-_BEFORE_NS: Final = 5 * NS_PER_S
-_NEXT_NS: Final = 4 * NS_PER_S
-_NEVER_NS: Final = 3600 * NS_PER_S
-_KNOWN_NS: Final = 60 * NS_PER_S
-"""What a localiser said holds as long; it says nothing while the robot stands."""
-
-
-def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
-    """Returns which spots and which looks are in a slice in which localisation was poor."""
-    starts, stops = _poor_times(sights.fixes)
-
-    def are_poor(first: Ints, last: Ints) -> Flags:
-        before = np.searchsorted(starts, last, side="right")
-        return (before > 0) & (np.append(stops, 0)[before - 1] >= first)
-
-    spots, looks = sights.spots, sights.looks
-    poor_spots = are_poor(spots[:, Spot.FIRST], spots[:, Spot.LAST])
-    poor_looks = are_poor(looks[:, Look.FIRST], looks[:, Look.LAST])
-    # Whole slices: else a look from beside would miss what a spot that is left out has seen.
-    slices = np.union1d(spots[poor_spots, Spot.SLICE], looks[poor_looks, Look.SLICE])
-    return np.isin(spots[:, Spot.SLICE], slices), np.isin(looks[:, Look.SLICE], slices)
-
-
-def _poor_times(fixes: Columns) -> tuple[Ints, Ints]:
-    """Returns when localisation was poor, as starts and stops (ns), both ascending."""
-    time = fixes[:, Fix.TIME]
-    after = np.diff(time, append=time[-1:] + _NEVER_NS)
-    after[after < 0] = _NEVER_NS  # the next one is of another session
-    jumped = np.flatnonzero((fixes[:, Fix.JUMP][1:] > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
-    # The last covariance that the localiser gave before each fix, unless it is too old.
-    sigma = fixes[:, Fix.SIGMA]
-    is_new = sigma >= 0
-    is_new[1:] |= after[:-1] > _KNOWN_NS
-    newest = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
-    vague = np.flatnonzero(sigma[newest] > _POOR_MM)
-    starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
-    stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
-    order = stable_order(starts)
-    return starts[order], np.maximum.accumulate(stops[order])

@@ -1,4 +1,4 @@
-"""Stays of labels at places: what is observed of them, and which of them are false.
+"""Stays of labels at places: what their spots say, and which of them are false.
 
 A label that is a small share of another's detections at a place, and is never in one message with
 it there, is that other thing under a wrong name.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -16,16 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.intervals import pieces_of
-from ros2_memory.analysis.sights import (
-    SCORE_BINS,
-    STOREY_MM,
-    Beside,
-    Floats,
-    Hit,
-    Score,
-    Spot,
-    Unplaced,
-)
+from ros2_memory.analysis.sights import STOREY_MM, Beside, Spot, Unplaced
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
@@ -37,20 +27,15 @@ from ros2_memory.core.arrays import (
     stable_order,
 )
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
-from ros2_memory.things.carried import carried_spots
 from ros2_memory.things.instances import PlacedStay, Tally, count_labels
-from ros2_memory.things.labels import moves_by_itself
-from ros2_memory.things.places import poorly_localised
-from ros2_memory.things.presence import Cells, Evidence, Stay, half_turns
+from ros2_memory.things.observations import FEWEST, Observations
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.sights import JoinedSights
-    from ros2_memory.things.labels import Labels
+    from ros2_memory.analysis.sights import Floats
+    from ros2_memory.things.presence import Evidence, Stay
 
-FEWEST: Final = 3
-"""Fewer detections are no thing: a detector sees what is not there."""
 _LOWEST_RATE: Final = 0.15
 """A thing that is seen less often than this when looked at is a false detection that repeats."""
 _SAME_PLACE_MM: Final = 450.0
@@ -68,8 +53,6 @@ _TINY_SHARE: Final = 0.1
 """... and this share of all that the host ever has."""
 _BESIDE_SHARE: Final = 0.2
 """A label that is beside the host in this share of its detections is a thing of its own."""
-_VIEW_SHARE: Final = 0.02
-"""The share of detections outside of each side of a field of view: they are mistaken."""
 _TAKEN_NS: Final = 20 * NS_PER_S
 _TAKEN_MM: Final = 2000.0
 """A robot that takes a thing along drives within so much time, and is first seen to so near."""
@@ -98,82 +81,6 @@ class LabelGroup:
     stays: list[PlacedStay] = field(default_factory=list)
     evidence: Evidence = field(init=False)
     is_crowded: bool = False
-
-
-class Observations:
-    """The sights of an estimate, and what is computed once for all labels.
-
-    Attributes:
-        counts: how many detections of each spot count; none of carried things.
-        carried: which spots are of carried things.
-        poor: which spots were seen while localisation was poor: they move nothing.
-        hits: the looks of detections that count, by spot; -1 where localisation was poor.
-        fields: the field of view of each topic; see `_fields_of_view`.
-        side: for each spot, the mean of the unit vectors to it from where it was seen; 0 if that
-            is unknown.
-        go_on: as in `estimate`.
-    """
-
-    def __init__(
-        self, sights: JoinedSights, labels: Labels, min_score: float, go_on: Callable[[], None]
-    ) -> None:
-        spots, self.sights, self.go_on = sights.spots, sights, go_on
-        self.counts = spots[:, Spot.N]
-        low = np.flatnonzero(sights.scores[:, Score.BIN] < lowest_bin(min_score))
-        spot, n = (sights.scores[low, name] for name in (Score.SPOT, Score.N))
-        self.counts -= np.bincount(spot, n, len(spots)).astype(np.int64)
-        # People who walk along are carried by nobody.
-        keys = map(labels.key, sights.labels)
-        goes = np.array([moves_by_itself(key) for key in keys], np.bool_)[spots[:, Spot.LABEL]]
-        self.carried = carried_spots(sights) & ~goes
-        self.counts[self.carried] = 0
-        self.poor, poor_looks = poorly_localised(sights)
-        # Which hits are of detections that count is not known: as many in proportion, rounded up.
-        spot, look, n = (sights.hits[:, name] for name in Hit)
-        n = -(-n * self.counts[spot] // spots[spot, Spot.N])
-        look[np.append(poor_looks, [False])[look]] = -1
-        spot, look, n = (column[n > 0] for column in (spot, look, n))
-        self.hits = Tally.of(len(spots), spot, look, n)
-        self.cells = Cells(sights, poor_looks)
-        spot, look, n = (column[look >= 0] for column in (spot, look, n))
-        distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
-        topic = spots[spot, Spot.TOPIC]
-        self.fields = _fields_of_view(topic, distance, bearing, n, len(sights.topics))
-        angle = np.radians(bearing + self.cells.heading(look))
-        sums = [np.bincount(spot, n * part, len(spots)) for part in (np.cos(angle), np.sin(angle))]
-        total = np.maximum(np.bincount(spot, n, len(spots)), 1)
-        self.side = np.stack(sums, axis=1) / total[:, None]
-
-    def firm(self, rows: Ints) -> Ints:
-        """Returns the spots seen while localisation was good; all spots if those are too few."""
-        good: Ints = rows[~self.poor[rows]]
-        return good if self.counts[good].sum() >= FEWEST else rows
-
-
-def _fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
-    """Returns how far (mm) each detector sees, in which direction, and how far to both sides of it.
-
-    Angles are in degrees. Nearly all detections of its topic lie there. `topics` is the number of
-    topics; `n` has the detections at each distance and bearing. The field of a topic without
-    detections is -1.
-    """
-    fields = np.full((topics, 4), -1.0)
-    toward = np.exp(1j * np.radians(bearing))
-    for number in np.flatnonzero(np.bincount(topic)).tolist():
-        rows = topic == number
-        quantile = partial(np.quantile, weights=n[rows], method="inverted_cdf")
-        far = quantile(distance[rows], 1 - _VIEW_SHARE)
-        # A camera that looks back sees from 150 to -150 degrees, not all between.
-        middle = round(np.degrees(np.angle(toward[rows] @ n[rows])))
-        beside = half_turns(bearing[rows] - middle)
-        sides = quantile(beside, [_VIEW_SHARE, 1 - _VIEW_SHARE])
-        fields[number] = far, middle, *sides
-    return fields
-
-
-def lowest_bin(min_score: float) -> int:
-    """Returns the lowest bin of scores that count."""
-    return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 
 def groups_in(observed: Observations, keys: Sequence[str]) -> list[LabelGroup]:
