@@ -506,10 +506,10 @@ class RobotPlaces:
         The middle of the standstill, or its start if the map jumps meanwhile; both of the part
         since the robot was localised, if it was not before.
         """
-        times = self._track_in(self.placement.frame_id).times
-        first, last = np.searchsorted(times, (start, end)).tolist()
-        if first < last and self._place_at(start, self.map_frame) is None:
-            start = int(times[first])
+        track = self._track_in(self.placement.frame_id)
+        first, last = np.searchsorted(track.times, (start, end)).tolist()
+        if first < last and place_at(track, start, SILENCE_NS) is None:
+            start = int(track.times[first])
         return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
