@@ -143,9 +143,9 @@ def _summed_ages(edges: Ints, times: Ints) -> Ints:
     A sum may wrap around. The difference of two sums, which is what callers use, is right.
     """
     ordered = np.sort(times)
-    counts_before = np.searchsorted(ordered, edges)
-    sums = np.concatenate((np.zeros(1, np.int64), np.cumsum(ordered)))
-    return counts_before.astype(np.int64) * edges - sums[counts_before]
+    counts_before: Ints = np.searchsorted(ordered, edges)
+    sums = np.append(0, np.cumsum(ordered))
+    return counts_before * edges - sums[counts_before]
 
 
 def time_bins(window: TimeWindow, by: ClockBin) -> TimeBins:

@@ -433,10 +433,9 @@ def _measured_leg(times: Ints, positions: Vectors) -> _MeasuredLeg:
 def _odd_steps(apart: Ints, steps_m: Floats, fastest_mps: float) -> list[int]:
     """Returns the indices of poses after which a gap, a jump or a reset may be."""
     plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
-    beside_m = np.maximum(
-        np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
-    )
-    odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
+    padded_m = np.pad(steps_m, 1)
+    beside_m = np.maximum(padded_m[:-2], padded_m[2:])
+    odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m)
     return np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
 
 
