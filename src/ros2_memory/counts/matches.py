@@ -193,11 +193,13 @@ def _boolean_held(
     if not condition.field and _has_lists(view, topic):
         return None
     parts, since = _events_in_order(view, topic, binned.counted)
+    events = joined_events([part.without_sights() for part in parts])
     before = _met_before(binned, topic, condition) if since is None else None
-    spans = _flag_spans(binned, topic, parts, condition, before, wanted=wanted)
-    if spans is None:
+    states = _flag_states(binned, topic, events, condition, before, wanted=wanted)
+    if states is None:
         return None
-    _note_uncounted(view, topic, parts)
+    _note_uncounted(view, topic, [events])
+    spans = _flag_spans(binned, topic, events, states)
     in_scope: list[_HeldSpan] = []
     try:
         # A scope reads what the other topics said from the newest message back.
@@ -291,22 +293,14 @@ def _visible_by_events(
 def _flag_spans(
     binned: BinnedWindow,
     topic: str,
-    parts: Sequence[TopicEvents],
-    condition: Condition,
-    before: bool | None,
-    *,
-    wanted: bool,
-) -> list[_HeldSpan] | None:
-    """Returns when a boolean held, in order; None if it is not clear which boolean is meant.
-
-    `before` is whether it held when the window began, or None if no earlier message says so.
-    """
-    events = joined_events([part.without_sights() for part in parts])
-    states = _flag_states(binned, topic, events, condition, before, wanted=wanted)
-    if states is None:
-        return None
+    events: TopicEvents,
+    states: Sequence[tuple[Ns, bool]],
+) -> list[_HeldSpan]:
+    """Returns when a boolean held, in order, by its states; see `_flag_states`."""
     last = binned.window.start if events.is_empty else events.last
     end = held_until(binned.view, topic, last, max(last, binned.window.stop), or_rare=True)
+    if events.left_out and states:
+        end, _ = states[-1]  # later changes are left out
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
     gaps = _gaps_for_topic(binned, topic)
     # What holds at first may have begun before the window, and what holds after a gap in it.
@@ -331,7 +325,8 @@ def _flag_states(
 ) -> list[tuple[Ns, bool]] | None:
     """Returns whether a boolean had the wanted value, from each of some log times on.
 
-    None if it is not clear which boolean the condition means.
+    None if it is not clear which boolean the condition means. `before` is whether it had that value
+    when the window began; None if no earlier message says so.
     """
     start, _ = binned.counted.asked()
     states = [] if before is None else [(start, before)]

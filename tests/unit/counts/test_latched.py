@@ -28,6 +28,19 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@each_way
+def test_of_more_changes_than_memory_holds_the_first_are_counted_and_a_note_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+) -> None:
+    """It toggles each second for 100 s; no question may know of more than 25 changes."""
+    monkeypatch.setattr("ros2_memory.analysis.topic_events.MAX_EVENTS", 25)
+    write_splits(tmp_path, [boolean(T0 + at * S, at % 2 == 1, BUMPER) for at in range(100)], 10)
+    counted = matches(tmp_path, BUMPER, 0, 99, recalls=recalls, by="day")
+    whole = table(counted)["all"]
+    assert (whole["count"], whole["seconds"], whole["last_unix"]) == (13, 12, T0 / S + 25)
+    assert f"{BUMPER} changes too often to count all: {99 - 25} more" in counted["notes"]
+
+
 def matches(
     bag_dir: Path, topic: str, first: float, last: float, *, recalls: bool, **more: object
 ) -> Any:
