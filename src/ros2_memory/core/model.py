@@ -303,18 +303,3 @@ class StampedTransform:
     log_time: Ns
     transform: Transform
     static: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Selected:
-    """The rows that a statement of SQL selected.
-
-    Attributes:
-        columns: the names of the columns.
-        rows: the values of each row as JSON; times are texts.
-        is_cut: whether there are more rows.
-    """
-
-    columns: list[str]
-    rows: list[list[JsonValue]]
-    is_cut: bool = False

@@ -180,9 +180,7 @@ class _FleetQuestion:
         # A full page of the newest rows spares robots with older data most of their search.
         robots = sorted(robots, key=lambda robot: robot.latest or MIN_NS, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        wanted = given.get("limit")
-        if wanted is None:
-            wanted = self.tool.arguments.get("limit", {}).get("default")
+        wanted = given.get("limit") or self.tool.arguments.get("limit", {}).get("default")
         limit = int(wanted) if isinstance(wanted, int | float) else None
         page = Page(limit, oldest_first=given.get("oldest_first") is True)
         answers = self.fan_out.ask(robots, partial(self._reply, now, page), call)

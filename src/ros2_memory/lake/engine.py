@@ -24,7 +24,7 @@ from pyiceberg.io.pyarrow import PyArrowFileIO
 from ros2_memory.core.errors import BusyError, RefusedError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.lake.select import Select, TableFiles
+from ros2_memory.lake.select import Select, Selected, TableFiles
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.lake.warehouse import Partitions
 from ros2_memory.storage.cache import ByteLru
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.core.model import Selected
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.warehouse import Days, LakeFile
 

@@ -34,7 +34,6 @@ from ros2_memory.core.errors import (
     RefusedError,
 )
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import Selected
 from ros2_memory.core.text import abbreviate, shortened
 
 if TYPE_CHECKING:
@@ -97,6 +96,20 @@ Node: TypeAlias = "dict[str, JsonValue]"
 """A node of a parse tree."""
 
 log = get_logger(__name__)
+
+
+class Selected(NamedTuple):
+    """The rows that a SELECT selected.
+
+    Attributes:
+        columns: the names of the columns.
+        rows: the values of each row as JSON; times are texts.
+        is_cut: whether there are more rows.
+    """
+
+    columns: list[str]
+    rows: list[list[JsonValue]]
+    is_cut: bool = False
 
 
 class TableFiles(NamedTuple):
@@ -326,9 +339,7 @@ def main() -> None:
     # If the parent is killed, nobody else ends this process.
     signal.setitimer(signal.ITIMER_REAL, max(left_s, 0.0) + 1.0)
     try:
-        selected = select.rows(tables)
-        # `asdict` would copy every value.
-        answer = {"columns": selected.columns, "rows": selected.rows, "is_cut": selected.is_cut}
+        answer = select.rows(tables)._asdict()
     except EpisodicError as error:
         # The cause may name a path: it is only for the log.
         cause = _short(str(error.__cause__ or "")) if isinstance(error, RefusedError) else ""
