@@ -159,9 +159,10 @@ class HeldValues:
                 raise InvalidArgumentsError(f"{asked}: {sentence}")
         if newest is not None and isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
+            how = f"as {self._topic}.FIELD" if asked == "with" else "where the tool takes fields"
             advice = self._advice_on_element(newest) or (
                 "ask about a topic that has one, such as std_msgs/msg/String, or name one of its "
-                "fields where the tool takes fields"
+                f"fields, {how}"
             )
             raise InvalidArgumentsError(
                 f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "

@@ -194,7 +194,7 @@ def with_robot(view: View, topic: str, episode: Episode, frame_id: str | None) -
 
 
 class MeanwhileReader:
-    """Reads the values that another topic held during intervals.
+    """Reads the values that another topic, or a field of it (`/task.state`), held during intervals.
 
     Raises:
         InvalidArgumentsError: its messages have more than one value.
@@ -203,8 +203,12 @@ class MeanwhileReader:
 
     def __init__(self, view: View, topic: str) -> None:
         self._view = view
-        self._topic = resolve_topic(view, topic)
-        self._values = HeldValues(view, self._topic, asked="with")
+        # No name of a ROS 2 topic has a dot; one of another program may.
+        name, _, field = (
+            (topic, "", "") if topic in view.timeline.topics() else topic.partition(".")
+        )
+        self._topic = resolve_topic(view, name)
+        self._values = HeldValues(view, self._topic, field or None, asked="with")
         self._is_over = False
 
     def during(self, first: Ns, until: Ns) -> tuple[Spell, ...] | None:

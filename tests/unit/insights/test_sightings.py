@@ -27,6 +27,7 @@ from ros2_memory.tools.replies import as_json
 from tests.support.bags import (
     McapLayout,
     Msg,
+    battery,
     boolean,
     detections,
     diagnostics,
@@ -669,3 +670,22 @@ def test_a_latched_value_that_is_said_again_is_one_sighting(tmp_path: Path, reca
 
     assert counted(0) == (2, 109.0), "for 11 s nothing was recorded"
     assert counted(20) == (1, 94.0), "the first began before"
+
+
+@each_way
+def test_with_takes_a_field_of_a_topic_whose_messages_have_several(
+    tmp_path: Path, recalls: bool
+) -> None:
+    messages = [boolean(BEGIN + at * S, 10 <= at < 20, "/bumper") for at in range(30)]
+    messages += [battery(BEGIN + at * S, 0.5 if at < 12 else 0.4) for at in range(0, 30, 4)]
+    messages.sort(key=lambda message: message.log_time)
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    by_field = {"with": "/battery_state.percentage", **bumped}
+    [row] = asked(memory, "find_matches", **by_field)["sightings"]
+    held = [(said["start"] - T0, round(said["value"], 3)) for said in row["with"]]
+    assert held == [(0.0, 0.5), (12.0, 0.4)]
+    refused = asked(memory, "find_matches", **{"with": "/battery_state", **bumped})
+    assert "name one of its fields, as /battery_state.FIELD" in refused["detail"]
+    unknown = asked(memory, "find_matches", **{"with": "/battery_state.mood", **bumped})
+    assert "mood" in unknown["detail"]
