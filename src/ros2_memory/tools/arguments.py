@@ -710,9 +710,9 @@ class MatchesArguments(ConditionArguments):
     oldest_first: Annotated[bool, Field(strict=True, description="With total.")] = False
     limit: _Limit = 5
     by: _ByInMatches | None = None
-    beside: (
-        Annotated[_Name, Field(description="What topic or /topic.field said.")] | None
-    ) = Field(default=None, alias="with", examples=["/action"])
+    beside: Annotated[_Name, Field(description="What topic or /topic.field said.")] | None = Field(
+        default=None, alias="with", examples=["/action"]
+    )
     where: _Where | None = None
     during: _While = Field(default=(), alias="while")
     frame_id: _FrameId | None = None

@@ -104,11 +104,11 @@ def test_what_the_clock_skipped_is_neither_recorded_nor_missing(tmp_path: Path) 
         assert note in reply["notes"]
         window = f"between {BEGIN - 100}.000000 and {BEGIN + 659}.900000"
         assert f"recorded only 160 of 260 s {window}" in reply["notes"]
-        for tool, inside in {
-            "get_position_at": {"timestamp": BEGIN + 300},
-            "get_topic_in_range": {"topic": "/odom", "start": BEGIN + 300, "end": BEGIN + 400},
-        }.items():
-            missing = asked(memory, tool, **inside)
+        inside: dict[str, Any] = {"topic": "/odom", "start": BEGIN + 300, "end": BEGIN + 400}
+        for missing in (
+            asked(memory, "get_position_at", timestamp=BEGIN + 300),
+            asked(memory, "get_topic_in_range", **inside),
+        ):
             assert (missing["error"], missing["notes"]) == ("no_data", [note])
 
 
