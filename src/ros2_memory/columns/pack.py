@@ -440,11 +440,9 @@ def _arrange(
         step = max(1, len(flat) // _LOOKED_AT)
         if _bits_of(delta[::step]) < _bits_of(flat[::step] - flat.mean()):
             name, head = "delta", head + struct.pack("<q", slope[0])
-            written = (delta << 1) ^ (delta >> 63)
-    greatest = int(written.view(np.uint64).max(initial=0))
-    width = (greatest.bit_length() + 7) // 8
-    data = head + byte_planes(written, width)
-    return Packed(f"{form} {name} {width}", len(flat), zone, error, data)
+            written = unsigned(delta)
+    width, planes = in_planes(written)
+    return Packed(f"{form} {name} {width}", len(flat), zone, error, head + planes)
 
 
 def _bits_of(numbers: Numbers) -> float:
@@ -474,8 +472,13 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     return numbers
 
 
+def unsigned(numbers: IntArray) -> IntArray:
+    """Returns signed numbers coded as 0, 1, 2, 3, 4 for 0, -1, 1, -2, 2."""
+    return (numbers << 1) ^ (numbers >> 63)
+
+
 def signed(numbers: Numbers) -> Numbers:
-    """Returns signed numbers, which are coded as 0, 1, 2, 3, 4 for 0, -1, 1, -2, 2."""
+    """Returns the numbers that `unsigned` coded."""
     signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
     return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
 
@@ -483,6 +486,13 @@ def signed(numbers: Numbers) -> Numbers:
 def _wrapped(number: int) -> np.int64:
     """Returns a number of 64 bits, signed or not, as an int64 with the same bits."""
     return np.int64(number - (1 << 64) if number >= 1 << 63 else number)
+
+
+def in_planes(numbers: IntArray) -> tuple[int, bytes]:
+    """Returns in how many bytes each number fits that has no sign, and their `byte_planes`."""
+    greatest = int(numbers.view(np.uint64).max(initial=0))
+    width = (greatest.bit_length() + 7) // 8
+    return width, byte_planes(numbers, width)
 
 
 def byte_planes(numbers: IntArray, width: int) -> bytes:

@@ -28,7 +28,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.columns.pack import byte_planes, compress, decompress, from_planes, signed
+from ros2_memory.columns.pack import compress, decompress, from_planes, in_planes, signed, unsigned
 from ros2_memory.core.arrays import (
     Columns,
     Ints,
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
 _Kind: TypeAlias = type[IntEnum]
 """The columns of a table, one of `TABLES`."""
 
-_SIGN: Final = 63
 _AT_ONCE: Final = 16
 """So many parts are unpacked together."""
 _TOPICS: Final[dict[_Kind, int]] = {
@@ -78,14 +77,12 @@ def pack_sights(sights: Sights, rows: Ints | None = None) -> bytes:
         rows: how many rows each section has in each table; None for a single section.
     """
     in_tables = [[*map(len, sights.tables)]] if rows is None else rows.tolist()
-    widths, planes = [], []
+    written = []
     for kind, table in zip(TABLES, sights.tables, strict=True):
         columns = table.T.copy()
         columns[_TIMES.get(kind, [])] //= NS_PER_US
-        steps = np.diff(columns, axis=1, prepend=0)
-        coded = (steps << 1) ^ (steps >> _SIGN)
-        widths.append((int(coded.max(initial=0)).bit_length() + 7) // 8)
-        planes.append(byte_planes(coded, widths[-1]))
+        written.append(in_planes(unsigned(np.diff(columns, axis=1, prepend=0))))
+    widths, planes = zip(*written, strict=True)
     head = json.dumps((sights.topics, sights.labels, in_tables, widths))
     return compress(b"".join((head.encode(), b"\n", *planes)))
 

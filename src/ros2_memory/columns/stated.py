@@ -191,18 +191,10 @@ def _state_facts(
     label_facts = joined_facts(labels)
     if label_facts.rows.size and np.bincount(label_facts.rows).max() > MOST[LABEL]:
         raise UnknownShapeError("more labels than are tracked")
-    flag_facts = [_flag_facts(values, path, leaf) for path, leaf in flags]
+    rows = np.arange(values.rows)
+    flag_facts = [_facts_of(FLAG, rows, values.numbers(leaf).values, path) for path, leaf in flags]
     number_facts, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
     return joined_facts([label_facts, *flag_facts, number_facts]), unsure
-
-
-def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
-    zone = values.zone(leaf)
-    if zone is not None and zone.least is not None and zone.least == zone.greatest:
-        flags = np.full(values.rows, float(zone.least))
-    else:
-        flags = values.numbers(leaf).values.astype(np.float64)
-    return _facts_of(FLAG, np.arange(values.rows), flags, path)
 
 
 def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
