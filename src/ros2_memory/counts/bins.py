@@ -144,7 +144,7 @@ def _summed_ages(edges: Ints, times: Ints) -> Ints:
     """
     ordered = np.sort(times)
     counts_before: Ints = np.searchsorted(ordered, edges)
-    sums = np.append(0, np.cumsum(ordered))
+    sums: Ints = np.append(0, np.cumsum(ordered))
     return counts_before * edges - sums[counts_before]
 
 

@@ -177,7 +177,7 @@ def changes_in(view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
         inside = earlier[topic] if topic in earlier else events_in(view, topic, window)
-        events = _with_state_before(view, topic, window, inside, types)
+        events = _with_state_before(view, topic, window, inside)
         if not events.is_empty:
             events_of_topics[topic] = events
         can_show_changes = any(map(has_changes, types)) or events.known
@@ -256,17 +256,14 @@ def _command_topic(view: View) -> str:
 
 
 def _with_state_before(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    events: TopicEvents,
-    types: Sequence[str],
+    view: View, topic: str, window: TimeWindow, events: TopicEvents
 ) -> TopicEvents:
     """Returns the events in a window, joined with the state before it.
 
     No events, if the topic cannot have changes, as a detector's: then nothing before is read.
     """
-    if not (LOG in types or events.is_empty or events.known):
+    is_log = LOG in view.timeline.types_of(topic)
+    if not (is_log or events.is_empty or events.known):
         return NO_EVENTS
     start = max(window.start - _LEAD_NS, MIN_NS)
     if _holds_over_runs(view, topic):
