@@ -817,7 +817,8 @@ def trajectory_summary(
     require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
-    note_runs(view, name, own_frame, window)
+    if frame_id in {None, own_frame}:
+        note_runs(view, name, own_frame, window)
     view.notes.add(*axes_of(frame_id or own_frame))
     elapsed = elapsed_in(view, window)
     # The least line has two ends: fewer waypoints are cut from it.

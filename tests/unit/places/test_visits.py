@@ -440,6 +440,8 @@ def test_of_several_runs_the_note_names_the_frame_that_is_or_may_be_the_map(
     notes = asked(memory_of(tmp_path), "trajectory_summary", **window)["notes"]
     advice = {"site": "if that is a map, set data.map_frame=site", "map": "ask with frame_id=map"}
     assert f"lead from it to {root}: {advice[root]}" in str(notes)
+    placed = asked(memory_of(tmp_path), "trajectory_summary", **window, frame_id=root)
+    assert (placed["frame_id"], "several runs" in str(placed["notes"])) == (root, False)
     if root == "map":
         return
     notes = asked(memory_of(tmp_path), "visits", x=1.0, y=0.0, radius_m=0.2)["notes"]
