@@ -160,11 +160,8 @@ class Texts:
         codes = self.codes[positions]
         if len(self.words) <= 1:
             return Texts(codes, self.words if codes.size else ())
-        used, first, nth = np.unique(codes, return_index=True, return_inverse=True)
-        order = np.argsort(first)
-        new_codes = np.empty(used.size, np.uint32)
-        new_codes[order] = np.arange(used.size, dtype=np.uint32)
-        return Texts(new_codes[nth], tuple(self.words[code] for code in used[order].tolist()))
+        used, new_codes = numbered(codes.tolist())
+        return Texts(new_codes.astype(np.uint32), tuple(self.words[code] for code in used))
 
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:
