@@ -114,7 +114,7 @@ class Robot:
         except NoDataError as error:
             detail = "; ".join((error.detail, *self._lake_report(call).notes))
             raise NoDataError(error.reason, detail, error.notes) from error
-        except (NotInLakeError, RefusedError, LakeError) as failure:
+        except (RefusedError, LakeError) as failure:
             lacks_payloads = isinstance(failure, NotInLakeError)
             if self.own is None or not (lacks_payloads or _reaches_back(self.own, since)):
                 raise

@@ -110,7 +110,7 @@ def expire(lake: LakeTables, until: Ns) -> int:
     gone: set[str] = set()
     state_dir = lake.location.state_dir
     with lake.location.translated("deleting old files of the lake"):
-        tables = [lake.tables[name].refresh() for name in TABLES]
+        tables = [table.refresh() for table in lake.tables.values()]
         for table in tables:
             _drop_versions(table, until)
         recorded = WRITTEN.rows(state_dir)
@@ -264,10 +264,9 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     # Earlier versions still have the rows, so they go whatever their age is.
     files = expire(lake, MAX_NS)
     kept_by: list[str] = []
-    for name in TABLES:
-        metadata = lake.tables[name].metadata
-        for ref, version in metadata.refs.items():
-            if version.snapshot_id != metadata.current_snapshot_id:
+    for name, table in lake.tables.items():
+        for ref, version in table.metadata.refs.items():
+            if version.snapshot_id != table.metadata.current_snapshot_id:
                 kept_by.append(f"{name}: {ref}")
     append_tombstone(lake.location.state_dir, tombstone, done=True)
     log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)

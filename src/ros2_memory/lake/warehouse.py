@@ -91,8 +91,6 @@ class RecordingFileIO(PyArrowFileIO):
 
     def new_output(self, location: str) -> PyArrowFile:
         """Returns a file to be written."""
-        from pathlib import Path  # noqa: PLC0415 - pyiceberg reads this class's annotations
-
         record = self.properties.get(RECORD)
         if record:
             # With a REST catalogue nothing else is there before the first table.
