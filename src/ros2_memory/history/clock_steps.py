@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.arrays import Ints
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns, Span
     from ros2_memory.history.view import View
 
@@ -88,25 +89,21 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     steps = [step for step in around if _reaches_into(window, step)]
     _note_pauses(view, window)
     for at, by in steps:
-        view.notes.add(_describe_step(at, by))
+        when = unix_text(at)
+        if by > 0:
+            note = f"the clock was set {seconds(by)} ahead at {when}: durations are without that"
+        else:
+            note = (
+                f"the clock was set back by {seconds(-by)} or more at {when}: durations across "
+                "that are too short by as much"
+            )
+        view.notes.add(note)
     return Elapsed(steps)
 
 
-def note_skipped(view: View, window: TimeWindow) -> None:
-    """Notes the step of the clock that skipped a whole window."""
-    for at, by in _steps_in_time(view, window) or ():
-        if at <= window.start and window.stop <= at + by:
-            view.notes.add(_describe_step(at, by))
-
-
-def _describe_step(at: Ns, by: Ns) -> str:
-    if by > 0:
-        ahead = f"the clock was set {seconds(by)} ahead at {unix_text(at)}"
-        return f"{ahead}: durations are without that"
-    return (
-        f"the clock was set back by {seconds(-by)} or more at {unix_text(at)}: durations across "
-        "that are too short by as much"
-    )
+def skipped_in(view: View, window: TimeWindow) -> Spans:
+    """Returns the times of a window, and around it, that steps forward skipped, in order."""
+    return [(at, at + by) for at, by in _steps_in_time(view, window) or () if by > 0]
 
 
 def _steps_in_time(view: View, window: TimeWindow) -> list[ClockStep] | None:

@@ -619,7 +619,9 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(before, after) > _EDGE_NS:
-        length = view.elapsed_in(counted_window).between(start, end)
+        length = end - start
+        if view.skipped_in(counted_window):
+            length = view.elapsed_in(counted_window).between(start, end)
         recorded = max(length - before - after - gaps, 0)
         digits = 0 if length >= 100 * NS_PER_S else 1
         recorded_s = f"{unix_from_ns(recorded):.{digits}f}"
@@ -702,7 +704,7 @@ def unknown_times(
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (0, 0)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
-    gaps = united([*recording_gaps(view), *view.elapsed_in(window).skipped])
+    gaps = united([*recording_gaps(view), *view.skipped_in(window)])
     between = without([around], united([*known, *mixed, *gaps]))
     long = [(begin, stop) for begin, stop in between if stop - begin > SILENCE_NS]
     unknown: Spans = []

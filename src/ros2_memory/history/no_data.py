@@ -530,7 +530,8 @@ def require_fields(view: View, topic: str, fields: Sequence[str], until: Ns) -> 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:
     """Returns the error with all notes, also on unread data, and a step of the clock."""
-    view.note_skipped(window)
+    if any(at <= window.start and window.stop <= end for at, end in view.skipped_in(window)):
+        view.elapsed_in(window)
     note_unread(view, window, nothing=True)
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 

@@ -17,7 +17,7 @@ from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.spans import overlaps_any
+from ros2_memory.core.spans import Spans, overlaps_any
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.clock_steps import elapsed_in, note_skipped, without_steps
+from ros2_memory.history.clock_steps import elapsed_in, skipped_in, without_steps
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
@@ -181,9 +181,9 @@ class View:
         """Returns how much time passed between moments of a window, with a note on each step."""
         return elapsed_in(self, window)
 
-    def note_skipped(self, window: TimeWindow) -> None:
-        """Notes the step of the clock that skipped a whole window."""
-        note_skipped(self, window)
+    def skipped_in(self, window: TimeWindow) -> Spans:
+        """Returns the times in and around a window that steps of the clock skipped, in order."""
+        return skipped_in(self, window)
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns by type the totals of a topic, each message counted once.
