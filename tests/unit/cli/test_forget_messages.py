@@ -396,6 +396,23 @@ def test_of_a_place_what_was_recorded_while_nobody_knew_where_the_robot_was_is_s
     assert f"what is not known: where the robot was is not known {unknown}" in shown
 
 
+def test_of_a_place_nothing_stays_because_the_clock_was_set_ahead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    """The robot drives on while the clock skips 8 s, of which nothing can have been recorded."""
+    home, places = tmp_path / "home", tmp_path / "places.yaml"
+    body = [odom(T0 + n * S // 10 + 8 * S * (n >= 305), n / 20, 0.0) for n in range(600)]
+    body += [text(T0 + n * S + 8 * S * (n > 30) + 7, SAID, CAMERA) for n in range(60)]
+    left(write_mcap(home / "rec_h" / "rec_h_0.mcap", body))
+    own_all(home)
+    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    shown = forget(0, 0, 100, f"--yes --where bathroom data.places_file={places}").out
+    assert "what is not known" not in shown
+
+
 def test_whatever_was_done_before_the_power_went_the_next_forget_finishes_it_and_says_so(
     tmp_path: Path,
     bag_dir: Path,
