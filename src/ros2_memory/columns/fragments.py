@@ -74,8 +74,8 @@ class FragmentKind(NamedTuple, Generic[T]):
 def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """Returns a fragment as bytes: a line of JSON, then the bytes of arrays one after the other.
 
-    In the JSON all but numbers, texts and None is an object with one key: what is made of the list
-    of arguments behind it, such as `tuple`, or the number of a class.
+    In the JSON all but numbers, texts and None is an object with one key, which says what makes the
+    value of the list behind it: `tuple`, `dict`, `bytes`, `array`, or the number of a class.
     """
     numbers = {cls: str(number) for number, cls in enumerate(classes)}
     data: list[bytes] = []
@@ -92,6 +92,7 @@ def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
         if isinstance(value, dict):
             maker, arguments = "dict", value.items()
         elif is_dataclass(value):
+            maker = numbers[type(value)]
             arguments = [getattr(value, attribute.name) for attribute in fields(value)]
         elif not isinstance(value, tuple | list):
             return value
