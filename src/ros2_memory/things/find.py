@@ -116,8 +116,12 @@ def find_things(
         view.notes.add(describe_misdated(view.snapshot.misdated))
     shown = tuple(finder.describe(thing) for thing in found[:limit])
     view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
-    instances = [thing.thing for thing in found[:limit] if isinstance(thing.thing, Instance)]
-    view.notes.add(*renamed_notes(known, instances))
+    last_stays = [
+        (thing.thing, thing.stays[-1][-1].stay)
+        for thing in found[:limit]
+        if isinstance(thing.thing, Instance)
+    ]
+    view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
@@ -141,11 +145,7 @@ def find_things(
         notes=(
             *view.notes.sentences(),
             *notes_on(view, known.by_all, question),
-            *scatter_notes(
-                (thing.thing, thing.stays[-1][-1].stay)
-                for thing in found[:limit]
-                if isinstance(thing.thing, Instance)
-            ),
+            *scatter_notes(last_stays),
         ),
     )
 
