@@ -184,18 +184,35 @@ class RowMaker:
 
     def _derive(self, bags: Collection[BagFile]) -> _Derived:
         """Reads the poses, events, things and detections of all bags at once."""
+        view, files = self._view, {bag.file for bag in bags}
         window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
-        files = {bag.file for bag in bags}
-        events, files_by_topic = self._events(window, files)
         things: dict[BagFile, list[Row]] = defaultdict(list)
         for bag, frame, sights in self._sight_reader.sights_by_bag([*bags]):
             things[bag] += self._things(frame, sights)
+        events: dict[str, list[Row]] = defaultdict(list)
         detections: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
-        for topic, among in files_by_topic.items():
-            for rows_of_bags in scan(self._view, topic, window, copies=True):
-                for bag, positions in rows_of_bags.bag_rows(among):
-                    detections[bag][topic].append(rows_of_bags.some(positions))
+        for topic in view.timeline.topics():
+            types = view.timeline.types_of(topic)
+            if not any(map(has_events, types)):
+                continue
+            tables = scan(view, topic, window, copies=True)
+            by_file = events_by_bag(view, tables, files)
+            for file, of_topic in by_file.items():
+                events[file] += self._events_of(topic, of_topic)
+            # A bag whose events show no detections is not decoded.
+            seen = {file for file, of_topic in by_file.items() if of_topic.visible.size}
+            if seen and any(map(may_have_detections, types)):
+                for bag, rows in self._rows_by_bag(topic, window, seen):
+                    detections[bag][topic].append(rows)
         return _Derived(self._poses_by_file(bags, window), events, things, detections)
+
+    def _rows_by_bag(
+        self, topic: str, window: TimeWindow, files: Collection[str]
+    ) -> Iterator[tuple[BagFile, Rows]]:
+        """Yields the messages of a topic in each of some bags, which may come several times."""
+        for rows in scan(self._view, topic, window, copies=True):
+            for bag, positions in rows.bag_rows(files):
+                yield bag, rows.some(positions)
 
     def _poses_by_file(self, bags: Collection[BagFile], window: TimeWindow) -> Mapping[str, Poses]:
         """Returns the robot's poses in each bag, by transforms where no topic has poses.
@@ -206,10 +223,8 @@ class RowMaker:
         parts: dict[str, list[Poses]] = defaultdict(list)
         if self._body is None:
             reader, files = PoseReader(view), {bag.file for bag in bags}
-            for rows in scan(view, self._path_topic, window, copies=True):
-                for bag, positions in rows.bag_rows(files):
-                    poses = reader.poses_of_all(rows.some(positions))
-                    parts[bag.file].append(poses or NO_POSES)
+            for bag, rows in self._rows_by_bag(self._path_topic, window, files):
+                parts[bag.file].append(reader.poses_of_all(rows) or NO_POSES)
         else:
             for bag in bags:
                 session = view.sessions.session_of(bag.recording)
@@ -417,25 +432,6 @@ class RowMaker:
             times = {"time_ns": record.log_time, "publish_ns": record.publish_time}
             yield {"topic": topic, "type": kind, **times, "message": numbers[topic], **value}
             numbers[topic] += 1
-
-    def _events(
-        self, window: TimeWindow, files: Collection[str]
-    ) -> tuple[dict[str, list[Row]], dict[str, set[str]]]:
-        """Returns the events by file, and by topic the files that may have detections."""
-        rows_by_file: dict[str, list[Row]] = defaultdict(list)
-        files_by_topic: dict[str, set[str]] = defaultdict(set)
-        for topic in self._view.timeline.topics():
-            types = self._view.timeline.types_of(topic)
-            if not any(map(has_events, types)):
-                continue
-            may_be_seen = any(map(may_have_detections, types))
-            tables = scan(self._view, topic, window, copies=True)
-            for file, events in events_by_bag(self._view, tables, files).items():
-                rows_by_file[file] += self._events_of(topic, events)
-                # A topic whose events show no detections is not decoded.
-                if may_be_seen and events.visible.size:
-                    files_by_topic[topic].add(file)
-        return rows_by_file, files_by_topic
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():
