@@ -89,8 +89,8 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     """Checks that fractions are not compared with percent: no message, or each, would match.
 
     sensor_msgs/BatteryState and RelativeHumidity ask for fractions, but some drivers publish
-    percent, or no charge. A note says where a battery has stated both. Nothing is refused or noted
-    if there is no time to look at all messages.
+    percent, or no charge. Notes say where a battery has stated both, and that a limit below 1 is
+    one in percent. Nothing is refused or noted if there is no time to look at all messages.
 
     Raises:
         InvalidArgumentsError: the limit is in percent, and all numbers are fractions.
@@ -101,9 +101,15 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     brief = View(view.memory, view.call.within(READING_S), view.reach)
     with suppress(QueryTimeoutError):
         if newest_above(brief, pattern, field, FULL_CHARGE) is not None:
-            for topic in matching_topics(brief, pattern):
-                if BATTERY in view.timeline.types_of(topic):
-                    view.notes.add(*_mixed_charges(brief, topic))
+            batteries = [
+                topic
+                for topic in matching_topics(brief, pattern)
+                if BATTERY in view.timeline.types_of(topic)
+            ]
+            mixed = [note for topic in batteries for note in _mixed_charges(brief, topic)]
+            is_low = 0 < test.limit < FULL_CHARGE and not mixed
+            percent = f"{field} is percent here: {test.limit:g} is {test.limit:g} %"
+            view.notes.add(*mixed, *([percent] if is_low else []))
             return
         newest = newest_above(brief, pattern, field, 0) if test.limit > FULL_CHARGE else None
         value = None if newest is None else brief.value(newest)

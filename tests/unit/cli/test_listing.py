@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from datetime import datetime
 from functools import partial
 from io import BytesIO, StringIO, TextIOWrapper
@@ -237,13 +237,17 @@ def test_index_fails_if_the_store_cannot_be_written(
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
     monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
 
-    def fill_the_disk(*_: object, **_how: object) -> None:
+    transaction = database._transaction
+
+    def fill_the_disk(connection: sqlite3.Connection, begin: str) -> AbstractContextManager[None]:
+        if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            return transaction(connection, begin)  # an empty file is made first
         error = sqlite3.OperationalError("database or disk is full")
         error.sqlite_errorcode = sqlite3.SQLITE_FULL
         raise error
 
     with monkeypatch.context() as full:
-        full.setattr(database, "_write_in_transaction", fill_the_disk)
+        full.setattr(database, "_transaction", fill_the_disk)
         failed = exits(2, "index --json")
     assert failed.json["stored"] == 0
     assert "the store of columns cannot be used: database or disk is full" in failed.err

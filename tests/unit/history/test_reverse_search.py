@@ -275,6 +275,8 @@ def test_percent_of_humidity_that_is_stated_as_a_fraction_is_refused(tmp_path: P
     assert question(memory, "find_last_match", value=0.8)["timestamp"] == T0_S
     memory = remembered(tmp_path / "percent", [humidity(0, 91.0), humidity(1, 60.0)])
     assert question(memory, "find_last_match", value=80)["timestamp"] == T0_S
+    noted = question(memory, "find_matches", value=0.8)["notes"]
+    assert "relative_humidity is percent here: 0.8 is 0.8 %" in noted
 
 
 @pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
