@@ -32,7 +32,7 @@ from ros2_memory.history.coverage import (
     was_removed,
     why_nothing,
 )
-from ros2_memory.history.held_values import is_text
+from ros2_memory.history.held_values import is_text, still_holds
 from ros2_memory.index.file_state import HELD_BACK
 
 if TYPE_CHECKING:
@@ -471,7 +471,8 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         f"no message of {' or '.join(topics)} between {unix_text(start)} and {unix_text(end)}"
     ]
     if older:
-        detail.append(f"the last one before is at {unix_text(older.time)}")
+        holds = ", and holds: ask about a moment" if still_holds(view, older, start) else ""
+        detail.append(f"the last one before is at {unix_text(older.time)}{holds}")
     if newer:
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     if older and newer:

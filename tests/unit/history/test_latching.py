@@ -97,6 +97,9 @@ def test_a_value_of_another_time_and_a_pose_say_that_they_are_latched(tmp_path: 
     bumped = {"condition_topic": "/bumper", "condition_type": "equals", "value": True}
     shown = asked(memory, "get_value_when", value_topic=MAP, **bumped)
     assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
+    window = {"topic": MAP, "start": T0 / S + 30, "end": T0 / S + 40}
+    refused = asked(memory, "get_topic_in_range", **window)["detail"]
+    assert f"the last one before is at {T0 // S}.000000, and holds: ask about a moment" in refused
     pose = asked(memory, "get_position_at", timestamp=T0 / S + 30)
     assert [note for note in pose["notes"] if "/odom is latched" in note and "30" in note]
 
