@@ -151,8 +151,9 @@ def _carried_spots(sights: JoinedSights) -> Flags:
     epoch = sights.epochs[spots[may_be, Spot.SLICE]]
     order = np.lexsort((first, label, topic, epoch))
     before, after = order[:-1], order[1:]
-    pause = first[after] - last[before]
-    is_step = (pause >= 0) & (pause <= _PAUSE_NS)
+    # Spots of one alone may overlap in time, as where the clock was set back.
+    pause, is_alone = first[after] - last[before], spots[may_be, Spot.TOGETHER] == 1
+    is_step = (pause <= _PAUSE_NS) & ((pause >= 0) | is_alone[before] & is_alone[after])
     for column in (label, topic, epoch):
         is_step &= column[before] == column[after]
     before, after = may_be[before], may_be[after]
