@@ -62,7 +62,7 @@ from ros2_memory.places.where import heard_times, known_track_for, parse_where
 from ros2_memory.results import Before, Event, PastChange, Recap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.standstills import Standstill
@@ -164,33 +164,24 @@ def recap(
     if region is not None:
         stays = known_track_for(view, region, window).inside(region.region, window)
         region_stays = _RegionStays(stays, drive.elapsed)
-    events_of_topics = events_by_topic(view, window)
-    least = memory.limits.min_score if min_score is None else min_score
-    reported = _reported_events(view, window, events_of_topics, region_stays)
-    things = _things_in_view(
-        view, window, events_of_topics, region_stays, min_score=least, most=most_events
+    topics = events_by_topic(view, window)
+    happened = _what_happened(
+        view,
+        window,
+        topics,
+        region_stays,
+        drive=drive,
+        places=places,
+        min_score=memory.limits.min_score if min_score is None else min_score,
+        most=most_events,
     )
-    stops = drive.stops
-    if region_stays is not None:
-        stops = [stop for stop in stops if region_stays.overlaps(*stop.span)]
-    goals = goals_in(view, window, events_of_topics)
-    events = [
-        *_stop_events(nsmallest(most_events, stops, key=lambda stop: -stop.length), places),
-        *reported,
-        *things.events,
-        *_recording_events(view, window, drive),
-        *(_goal_event(goal, start, drive.elapsed) for goal in goals),
-    ]
-    if region_stays is not None:
-        events = [event for event in events if region_stays.contains(event)]
     note_unread(view, window)
     note_edges(view, window)
     note_foxglove_logs(view, window)
-    counts = Counter(event.kind for event in events)
-    counts["thing"], counts["stop"] = things.total, len(stops)
-    shown = _most_important(view, events, counts, most_events)
+    counts = happened.counts
+    shown = _most_important(view, happened.events, counts, most_events)
     if with_changes:
-        shown = _with_changes(changes_in(view, window, events_of_topics), shown)
+        shown = _with_changes(changes_in(view, window, topics), shown)
     shown = [
         replace(
             event,
@@ -208,7 +199,7 @@ def recap(
         stood=_standing_time(view, drive),
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
-        throughout=tuple(sorted(things.throughout)),
+        throughout=tuple(sorted(happened.throughout)),
         counts=tuple((name, counts[kind]) for kind, name in _PLURALS.items() if counts[kind]),
         skipped=drive.elapsed.skipped_between(start, end),
     )
@@ -218,6 +209,52 @@ def recap(
         answer = replace(_with_path_in_region(answer, drive, region_stays), where=region.shown)
     view.notes.retract_outside(window)
     return replace(answer, notes=view.notes.sentences())
+
+
+class _Happened(NamedTuple):
+    """What happened in a window.
+
+    Attributes:
+        events: the events, but for short stops and sightings of which there are more than enough.
+        counts: by kind, how many there were.
+        throughout: the labels that were in view all the time.
+    """
+
+    events: Sequence[Event]
+    counts: Counter[str]
+    throughout: Collection[str]
+
+
+def _what_happened(
+    view: View,
+    window: TimeWindow,
+    topics: Mapping[str, TopicEvents],
+    region_stays: _RegionStays | None,
+    *,
+    drive: Drive,
+    places: RobotPlaces | None,
+    min_score: float,
+    most: int,
+) -> _Happened:
+    """Returns what happened in a window, with at most `most` stops and sightings."""
+    start, _ = window.asked()
+    things = _things_in_view(view, window, topics, region_stays, min_score=min_score, most=most)
+    stops = drive.stops
+    if region_stays is not None:
+        stops = [stop for stop in stops if region_stays.overlaps(*stop.span)]
+    goals = goals_in(view, window, topics)
+    events = [
+        *_stop_events(nsmallest(most, stops, key=lambda stop: -stop.length), places),
+        *_reported_events(view, window, topics, region_stays),
+        *things.events,
+        *_recording_events(view, window, drive),
+        *(_goal_event(goal, start, drive.elapsed) for goal in goals),
+    ]
+    if region_stays is not None:
+        events = [event for event in events if region_stays.contains(event)]
+    counts = Counter(event.kind for event in events)
+    counts["thing"], counts["stop"] = things.total, len(stops)
+    return _Happened(events, counts, things.throughout)
 
 
 def _standing_time(view: View, drive: Drive) -> Ns | None:
