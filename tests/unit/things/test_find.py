@@ -876,6 +876,15 @@ def test_what_was_only_seen_while_the_robot_carried_it_has_no_place(tmp_path: Pa
     assert found["notes"] == [note]
 
 
+def test_what_is_carried_at_two_times_of_one_clock_has_no_place(tmp_path: Path) -> None:
+    """As where the clock was set back: every other second is of 20 m farther on."""
+    xs = [(at, at / 10 + 20 * (at % 2)) for at in range(40)]
+    messages = [m for at, x in xs for m in scene(at, (x, 0.0, 0.0), [("cup", x + 0.6, 0.05)])]
+    found = told_of(tmp_path, messages, label="cup")
+    assert found["things"] == []
+    assert found["notes"][0].startswith("it was seen 40 times, last at ")
+
+
 def test_what_stands_in_a_row_beside_the_way_is_not_carried(tmp_path: Path) -> None:
     """A camera that looks to the side sees each of them abreast, for 1.2 m of the way."""
     boxes = [("box", 1.0 + 2 * nth, 0.9) for nth in range(5)]
