@@ -116,15 +116,9 @@ def find_things(
         view.notes.add(describe_misdated(view.snapshot.misdated))
     shown = tuple(finder.describe(thing) for thing in found[:limit])
     view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
-    last_stays = [
-        (thing.thing, thing.stays[-1][-1].stay)
-        for thing in found[:limit]
-        if isinstance(thing.thing, Instance)
-    ]
+    last_stays = _last_stays(found[:limit])
     view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
-    totals: Counter[str] = Counter()
-    for thing in found:
-        totals[thing.label] += thing.at_once or 1
+    totals = _totals(found)
     question = ThingsQuestion(
         labels=wanted,
         found=frozenset(key for thing in found for key in thing.keys),
@@ -148,6 +142,23 @@ def find_things(
             *scatter_notes(last_stays),
         ),
     )
+
+
+def _last_stays(found: Iterable[_FoundThing]) -> list[tuple[Instance, PlacedStay]]:
+    """Returns the things that stay somewhere, each with its last stay in the window."""
+    return [
+        (found_thing.thing, found_thing.stays[-1][-1].stay)
+        for found_thing in found
+        if isinstance(found_thing.thing, Instance)
+    ]
+
+
+def _totals(found: Iterable[_FoundThing]) -> Counter[str]:
+    """Returns by label how many things there are; of a place with several, how many were seen."""
+    totals: Counter[str] = Counter()
+    for thing in found:
+        totals[thing.label] += thing.at_once or 1
+    return totals
 
 
 def _rightly_dated(view: View, window: TimeWindow) -> TimeWindow:
