@@ -252,7 +252,7 @@ def lazy_columns(
         owners = np.asarray(column(f"{path}#"), np.int64)
         return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
-    # Owners that are all equal take no bytes, so they are never dropped.
+    # Owners that differ may be dropped: then the list is missing. Equal ones take no bytes.
     kept = {name: path for name, path in columns.items() if path not in dropped}
     lists = {name: path for name, path in sequences.items() if f"{path}#" not in dropped}
     return LazyMapping(kept, lambda name: column(kept[name])), LazyMapping(lists, elements)

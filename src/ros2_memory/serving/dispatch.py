@@ -328,18 +328,18 @@ class Dispatcher:
         # Around all of it: an error keeps what was read alive until it has become a reply.
         with call.reading(self.memory.large):
             try:
-                outcome = "ok", answer()
+                done = "ok", answer()
             except QueryTimeoutError as error:
                 timeout = QueryTimeoutError(
                     f"{error}{_note_on_wait(waited_s)}", error.searched_back_to
                 )
-                outcome = self._failed(BusyError(STOPPING) if self._stopping.is_set() else timeout)
+                done = self._failed(BusyError(STOPPING) if self._stopping.is_set() else timeout)
             except Exception as error:  # noqa: BLE001 - it is logged there
                 # Caught here too, because nobody may be waiting for this thread any more.
-                outcome = self._failed(error)
+                done = self._failed(error)
         if time.monotonic() - begun > _LONG_S:
             return_free_memory()
-        return outcome
+        return done
 
     def _failed(self, error: Exception) -> tuple[str, Reply]:
         """Returns the outcome and the reply of a call that an error ended.
