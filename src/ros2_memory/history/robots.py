@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 _NEAR_NS: Final = 10 * NS_PER_S
 """Recordings are of the time of a message if they are this near."""
 _SLOW_NS: Final = 600 * NS_PER_S
-"""Recordings are compared this far around a message: some topics have one only in minutes."""
+"""Recordings are compared this far around what is asked about: some topics have a message only in
+minutes, and in a few seconds each recorder may lose what the other one receives."""
 _TRIED: Final = 7
 """So many messages are looked for in the other recording: a subscriber may miss some."""
 _MAX_PAIRS: Final = 20
@@ -350,7 +351,8 @@ def _parallel_recordings(
                 pair = parallel.first, parallel.other
                 # Several robots in one folder have thousands of pairs: once is enough for each.
                 is_known = not parallel.by_clock and apart.issuperset(pair)
-                if not is_known and _differ(view, topic, pair, parallel.span.intersect(window)):
+                both = parallel.span.intersect(window.widened(_SLOW_NS))
+                if not is_known and _differ(view, topic, pair, both):
                     differing.append(parallel)
                     apart.update(() if parallel.by_clock else pair)
             return differing
@@ -379,7 +381,7 @@ def note_robots_near(view: View, stored: StoredMessage) -> None:
     topic, at = stored.topic, stored.time
     pairs = _overlapping_pairs(view, topic, TimeWindow.around(at, _NEAR_NS))
     if any(chain(pairs, _times_recorded_twice(view, TimeWindow(at, at + 1)))):
-        note_robots(view, topic, TimeWindow.around(at, _SLOW_NS))
+        note_robots(view, topic, TimeWindow.around(at, _NEAR_NS))
 
 
 class _TopicSpan(NamedTuple):
@@ -530,10 +532,9 @@ def _lacks_most(
         if stored is None:
             continue
         tried += 1
-        sought = stored.identity
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
         copies = _merged_messages(view, topic, other, near)
-        if all(copy.identity != sought for copy in copies):
+        if stored.identity not in (copy.identity for copy in copies):
             lacking += 1
         if 2 * lacking > _TRIED:
             return True  # the rest of the sample cannot change that

@@ -288,6 +288,21 @@ def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
         assert "several robots" not in str(ranged.get("notes"))
 
 
+def test_what_two_recorders_of_one_robot_lost_at_other_moments_makes_no_second_robot(
+    tmp_path: Path,
+) -> None:
+    """In the second from 25 on, neither has what the other one received."""
+    poses = [odom(T0 + n * S // 50, n / 100) for n in range(3000)]
+    record(tmp_path, "a", poses[:1250] + poses[1275:])
+    record(tmp_path, "b", poses[:1275] + poses[1300:])
+    memory = memory_of(tmp_path)
+    window = {"start": T0_S + 25, "end": T0_S + 25.98}
+    assert asked(memory, "recap", **window)["distance_m"] == pytest.approx(0.49, abs=0.02)
+    ranged = asked(memory, "get_topic_in_range", topic="/odom", **window)
+    assert (ranged["total"], ranged.get("notes")) == (50, None)
+    assert warned(memory) == []
+
+
 def test_two_robots_are_found_behind_however_many_handovers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
