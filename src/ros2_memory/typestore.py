@@ -60,6 +60,7 @@ int64 sequence_number
 """
 _KIND: Final = re.compile(r"/(?:srv|action)/")
 _SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
+_ACTION_PARTS: Final = 3
 _MSG_NOISE: Final = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_PIECE: Final = re.compile(
     r'"(?:\\.|[^"\\])*"?|/\*(?:.*?\*/|.*)|//[^\n]*|@[A-Za-z_]\w*(?:[ \t]*\()?|[()]|[^"/@()]+|.',
@@ -115,7 +116,8 @@ class Typestores:
             at any depth, or a package. If several folders have a type, the first one counts.
 
     Raises:
-        ConfigError: a path is not a folder, has no such file in it, or cannot be read.
+        ConfigError: a path is not a folder, has no such file in it, or cannot be read; or an
+            `.action` file lacks its parts.
     """
 
     def __init__(self, custom_msg_paths: Sequence[Path | str] = ()) -> None:
@@ -433,24 +435,28 @@ def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
         folders = {file.parent.parent for file in files}
         packages = {package: _package_name(package) for package in folders}
         for file in files:
-            text = file.read_text(encoding="utf-8", errors="replace")
+            text = file.read_text(encoding="utf-8-sig", errors="replace")
             package = packages[file.parent.parent]
             if file.suffix == ".msg":
                 yield f"{package}/msg/{file.stem}", text
-            else:
-                yield from _feedback_of(f"{package}/action/{file.stem}", text)
+                continue
+            parts = _SERVICE.split(text)
+            if len(parts) < _ACTION_PARTS:
+                raise ConfigError(
+                    f"reader.custom_msg_paths: {file} is not an action definition: goal, result and"
+                    " feedback need a line between them that is '---' alone; correct or remove it"
+                )
+            yield from _feedback_of(f"{package}/action/{file.stem}", parts[2])
     except OSError as error:
         raise ConfigError(f"reader.custom_msg_paths: {folder} cannot be read: {error}") from error
 
 
 def _feedback_of(action: str, text: str) -> Iterator[tuple[str, str]]:
     """Yields the names and texts of an action's feedback, and of the message that has it."""
-    _, _, *feedback = _SERVICE.split(text)
-    if feedback:
-        fields = _MSG_NOISE.sub("", feedback[0] + "\n").strip()
-        yield f"{action}_Feedback", fields or "uint8 structure_needs_at_least_one_member"
-        message = f"unique_identifier_msgs/UUID goal_id\n{action}_Feedback feedback\n"
-        yield f"{action}_FeedbackMessage", message
+    fields = _MSG_NOISE.sub("", text + "\n").strip()
+    yield f"{action}_Feedback", fields or "uint8 structure_needs_at_least_one_member"
+    message = f"unique_identifier_msgs/UUID goal_id\n{action}_Feedback feedback\n"
+    yield f"{action}_FeedbackMessage", message
 
 
 def _package_name(package: Path) -> str:

@@ -302,6 +302,35 @@ def test_feedback_of_an_action_is_decoded_by_its_action_file(tmp_path: Path) -> 
     assert isinstance(empty, MessageType)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "string room\n",
+        "string room\n---\nbool done\n",
+        "string room\n--- # done\n--- # so far\n",
+    ],
+)
+def test_a_file_that_defines_no_action_stops_the_start_and_is_named(
+    tmp_path: Path, text: str
+) -> None:
+    file = tmp_path / "cleaning_msgs" / "action" / "Clean.action"
+    file.parent.mkdir(parents=True)
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"custom_msg_paths: .*Clean\.action is not an action"):
+        Typestores([tmp_path])
+
+
+def test_definitions_that_begin_with_a_byte_order_mark_are_read(tmp_path: Path) -> None:
+    for kind, text in (("msg", "float32 dirt\n"), ("action", "---\n---\nuint32 rooms\n")):
+        file = tmp_path / "cleaning_msgs" / kind / f"Spot.{kind}"
+        file.parent.mkdir(parents=True)
+        file.write_text(text, encoding="utf-8-sig")
+    stores = Typestores([tmp_path])
+    for name in ("msg/Spot", "action/Spot_FeedbackMessage"):
+        assert isinstance(stores.lookup(f"cleaning_msgs/{name}", "", b""), MessageType)
+
+
 def test_the_name_in_package_xml_counts_before_the_folders(vision: Path) -> None:
     (vision / "package.xml").write_text("<package><name>other_msgs</name></package>")
     stores = Typestores([vision])
