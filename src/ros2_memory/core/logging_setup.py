@@ -53,6 +53,8 @@ _LIBRARY: Final = "mcp"
 _LIBRARIES: Final = ("asyncio", "mcp", "starlette", "uvicorn")
 _KIND_CHARS: Final = 32
 _MAX_KINDS: Final = 256
+_OTHER_KINDS: Final = object()
+"""The kind of all events of other kinds while so many are known."""
 
 
 def configure_logging(
@@ -159,18 +161,32 @@ class LogThrottle:
         self._lock = threading.RLock()
 
     def count(self, kind: Hashable) -> int:
-        """Counts an event; returns how many are to be logged as one, or 0 if none is now."""
+        """Counts an event; returns how many are to be logged as one, or 0 if none is now.
+
+        While 256 kinds are known, all other kinds count as one.
+        """
         with self._lock:
-            self._counts[kind] += 1
             now = self._monotonic()
-            if now < self._silent_until.get(kind, now):
+            counted_as = self._known_kind(kind, now)
+            self._counts[counted_as] += 1
+            if now < self._silent_until.get(counted_as, now):
                 return 0
-            count = self._counts.pop(kind)
-            if len(self._silent_until) >= _MAX_KINDS:
-                self._silent_until.clear()
-                self._counts.clear()
-            self._silent_until[kind] = now + self._every_s
-            return count
+            self._silent_until[counted_as] = now + self._every_s
+            return self._counts.pop(counted_as, 0)
+
+    def _known_kind(self, kind: Hashable, now: float) -> Hashable:
+        """Returns the kind that an event counts as. Makes room if there is none."""
+        if kind in self._silent_until or len(self._silent_until) < _MAX_KINDS:
+            return kind
+        self._forget_expired(now)
+        return kind if len(self._silent_until) < _MAX_KINDS else _OTHER_KINDS
+
+    def _forget_expired(self, now: float) -> None:
+        """Forgets the kinds that may be logged again; what they counted joins the other kinds."""
+        for kind, silent_until in [*self._silent_until.items()]:
+            if silent_until <= now and kind is not _OTHER_KINDS:
+                self._silent_until.pop(kind, None)
+                self._counts[_OTHER_KINDS] += self._counts.pop(kind, 0)
 
 
 class _LibraryFilter(logging.Filter):

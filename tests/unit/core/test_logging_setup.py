@@ -116,3 +116,30 @@ def test_an_event_of_each_of_two_threads_is_counted_once() -> None:
     throttle = LogThrottle(now, every_s=0.0)
     with ThreadPoolExecutor(2) as pool:
         assert sum(pool.map(throttle.count, ["refused", "refused"])) == 2
+
+
+def test_of_more_kinds_than_are_told_apart_few_events_are_logged_and_all_are_counted() -> None:
+    now = [0.0]
+    throttle = LogThrottle(lambda: now[0], every_s=10.0)
+    assert [throttle.count(nth) for nth in range(256)] == [1] * 256
+    others = [throttle.count(nth) for nth in range(1000, 4000)]
+    assert (others[0], sum(others)) == (1, 1)
+    assert [throttle.count(7), throttle.count(8)] == [0, 0]
+    now[0] = 10.0
+    assert throttle.count(7) == 2
+    logged = [count for nth in range(5000, 6000) if (count := throttle.count(nth))]
+    assert len(logged) < 256
+    # Of the other kinds, what was silent, that of the forgotten kind 8, and the present one.
+    assert max(logged) == 2999 + 1 + 1
+
+
+def test_what_is_silent_stays_silent_when_many_other_kinds_come() -> None:
+    now = [0.0]
+    throttle = LogThrottle(lambda: now[0], every_s=10.0)
+    assert [throttle.count("refused") for _ in range(6)] == [1, 0, 0, 0, 0, 0]
+    now[0] = 1.0
+    for nth in range(400):
+        throttle.count(nth)
+    assert throttle.count("refused") == 0
+    now[0] = 11.0
+    assert throttle.count("refused") == 7
