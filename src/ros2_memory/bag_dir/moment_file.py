@@ -383,7 +383,7 @@ class RequestQueue:
         except FileNotFoundError:
             return None  # withdrawn
         except (OSError, ValueError) as error:
-            self._ignored.add(path.name)
+            self._ignored |= {name, path.name}
             _log.warning("request_ignored", path=str(path), reason=str(error))
             refused = f"the recorder cannot read the request: {error}"
             with suppress(OSError):

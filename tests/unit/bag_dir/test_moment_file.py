@@ -178,6 +178,20 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     assert not queue.has_requests()
 
 
+def test_requests_whose_place_is_taken_hold_nobody_up(tmp_path: Path) -> None:
+    """A request is renamed when it is taken, and a folder already has each new name."""
+    folder = tmp_path / REQUESTS_FOLDER
+    for number in range(MAX_AT_ONCE):
+        (folder / f"{number:032x}.taken").mkdir(parents=True)
+        (folder / f"{number:032x}.json").write_text("{}")
+    asked(tmp_path)
+    queue = RequestQueue(tmp_path)
+    with capture_logs() as captured:
+        assert sum(refuse_all(queue) for _ in range(4)) == 1
+    assert [event["event"] for event in captured] == ["request_ignored"] * (2 * MAX_AT_ONCE)
+    assert not queue.has_requests()
+
+
 def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
