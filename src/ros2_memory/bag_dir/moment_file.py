@@ -319,7 +319,10 @@ class PendingRequest:
         return None
 
     def withdraw(self) -> bool:
-        """Withdraws the request; returns False if the recorder has begun with it, or answered."""
+        """Withdraws the request.
+
+        Returns False if it cannot be withdrawn, mostly because the recorder has begun with it.
+        """
         with suppress(OSError):
             self._path("json").unlink()
             return True

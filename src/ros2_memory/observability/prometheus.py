@@ -1,7 +1,8 @@
 """Metrics for Prometheus, in a registry of their own.
 
 The process itself has no metrics here: whatever runs the server measures all its processes. Labels
-are bounded: tools of this server or `unknown`, and the outcomes and reasons of the error tree.
+are bounded: tools of this server or `unknown`, outcomes and reasons of the error tree, states, and
+recorded topics that lost messages in the last hour.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ros2_memory.core.telemetry import Answered, Exposition, Observer
 from ros2_memory.core.timebase import Ns, unix_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from prometheus_client.metrics_core import Metric
 
@@ -157,9 +158,11 @@ def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
     yield _by_state(
         "ros2_memory_files_set_aside",
         "Files in the bag directory: still being written, unreadable, or of another storage.",
-        active=len(snapshot.active),
-        damaged=len(snapshot.damaged),
-        unread=len(snapshot.unread),
+        {
+            "active": len(snapshot.active),
+            "damaged": len(snapshot.damaged),
+            "unread": len(snapshot.unread),
+        },
     )
     yield GaugeMetricFamily(
         "ros2_memory_kept_bytes",
@@ -187,7 +190,7 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     yield _by_state(
         "ros2_memory_recorder_state",
         "1 for the state that the recorder last reported.",
-        **{str(state): int(state is heartbeat.state) for state in RecorderState},
+        {str(state): int(state is heartbeat.state) for state in RecorderState},
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_state_since_timestamp_seconds",
@@ -224,7 +227,7 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     )
 
 
-def _by_state(name: str, documentation: str, **values: int) -> GaugeMetricFamily:
+def _by_state(name: str, documentation: str, values: Mapping[str, int]) -> GaugeMetricFamily:
     family = GaugeMetricFamily(name, documentation, labels=("state",))
     for state, value in values.items():
         family.add_metric((state,), value)
