@@ -143,6 +143,12 @@ class IntervalTable(NamedTuple):
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
         return self._select(self._by_length()[:at_most]).intervals()
 
+    def longest_of_each(self) -> IntervalTable:
+        """Returns the longest interval of each label; of equally long ones the earliest."""
+        by_length = self._by_length()
+        _, longest = np.unique(self._array["label"][by_length], return_index=True)
+        return self._select(np.sort(by_length[longest]))
+
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """Returns the labels seen at their usual rate all the time from `start` to `end`."""
         rows = self._array

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
 from ros2_memory.analysis.goals import FAILURES
-from ros2_memory.analysis.intervals import IntervalTable, united_tables
+from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval, united_tables
 from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
@@ -201,6 +201,7 @@ def recap(
         events=tuple(shown),
         throughout=tuple(sorted(happened.throughout)),
         counts=tuple((name, counts[kind]) for kind, name in _PLURALS.items() if counts[kind]),
+        longest_sights=tuple(happened.longest_sights),
         skipped=drive.elapsed.skipped_between(start, end),
     )
     if region_stays is None or region is None:
@@ -218,11 +219,13 @@ class _Happened(NamedTuple):
         events: the events, but for short stops and sightings of which there are more than enough.
         counts: by kind, how many there were.
         throughout: the labels that were in view all the time.
+        longest_sights: the longest sight of each other label, in order of time.
     """
 
     events: Sequence[Event]
     counts: Counter[str]
     throughout: Collection[str]
+    longest_sights: Sequence[Event]
 
 
 def _what_happened(
@@ -254,7 +257,7 @@ def _what_happened(
         events = [event for event in events if region_stays.contains(event)]
     counts = Counter(event.kind for event in events)
     counts["thing"], counts["stop"] = things.total, len(stops)
-    return _Happened(events, counts, things.throughout)
+    return _Happened(events, counts, things.throughout, things.longest_of_each)
 
 
 def _standing_time(view: View, drive: Drive) -> Ns | None:
@@ -409,11 +412,13 @@ class _ThingsInView(NamedTuple):
         events: the things that were seen longest.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
+        longest_of_each: the longest sight of each other label, in order of time.
     """
 
     events: list[Event]
     total: int
     throughout: set[str]
+    longest_of_each: list[Event]
 
 
 def _things_in_view(
@@ -425,7 +430,7 @@ def _things_in_view(
     min_score: float,
     most: int,
 ) -> _ThingsInView:
-    """Returns the things that were seen, with events of at most `most`.
+    """Returns the things that were seen, with events of at most `most`, and of as many labels.
 
     In a region nothing counts as seen throughout. A note says how many scores are too low.
     """
@@ -453,18 +458,27 @@ def _things_in_view(
     else:
         throughout = set()
         things = things.during([stay.span for stay in region_stays.stays])
-    events = [
-        Event(
-            "thing",
-            interval.first,
-            interval.last,
-            repeating(f"{interval.label} in view", [interval.label]),
-            goes_on=interval.last == last_seen.get(interval.label),
-            score=interval.best,
-        )
-        for interval in things.longest(most)
-    ]
-    return _ThingsInView(events, things.size, throughout)
+    longest_of_each = things.longest_of_each().most_lasting(most).intervals()
+    return _ThingsInView(
+        [_sight_event(interval, last_seen) for interval in things.longest(most)],
+        things.size,
+        throughout,
+        [_sight_event(interval, last_seen) for interval in longest_of_each],
+    )
+
+
+def _sight_event(interval: VisibleInterval, last_seen: Mapping[str, Ns]) -> Event:
+    """Returns a sight of a thing; it goes on if the label was last seen (ns) at its end."""
+    label = interval.label
+    return Event(
+        "thing",
+        interval.first,
+        interval.last,
+        repeating(f"{label} in view", [label]),
+        goes_on=interval.last == last_seen.get(label),
+        score=interval.best,
+        label=label,
+    )
 
 
 def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[Event]:

@@ -246,6 +246,7 @@ class Event:
         skipped: how much of its time the clock skipped.
         point: where the robot was (m), in the frame of the recap; None if that is not known.
         topic: whose message it is, of booleans; else empty.
+        label: of a thing in view; else empty.
     """
 
     kind: str
@@ -259,6 +260,7 @@ class Event:
     skipped: Ns = 0
     point: tuple[float, float] | None = None
     topic: str = ""
+    label: str = ""
 
 
 @result(
@@ -294,6 +296,8 @@ class Recap(AnswerWithNotes):
         events: what happened, in order of time.
         throughout: things that a detector saw during the whole window at its usual rate.
         counts: how many events of each kind there were, with those that are not listed.
+        longest_sights: the longest sight of each other label, in order of time; of as many labels
+            as there may be events.
         path_sum_m: the plain sum of distances, if noise adds much to it.
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
         where: the name or the bounds of the region that was asked about; None for everywhere.
@@ -312,6 +316,7 @@ class Recap(AnswerWithNotes):
     events: tuple[Event, ...]
     throughout: tuple[str, ...]
     counts: tuple[tuple[str, int], ...] = ()
+    longest_sights: tuple[Event, ...] = ()
     path_sum_m: float | None = None
     gap_m: float | None = None
     where: JsonValue = None

@@ -103,7 +103,8 @@ def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
     assert found["robot"]["x"] == 30.0
     stops = [each for each in found["events"] if each["kind"] == "stop"]
     assert [(each["x"], each["y"]) for each in stops] == [(10.0, 0.0), (20.0, 0.0), (30.0, 0.0)]
-    assert {each["text"] for each in found["events"] if each["kind"] == "thing"} == {"cup in view"}
+    things = [each for each in found["events"] if each["kind"] == "thing"]
+    assert {(each["text"], each["label"]) for each in things} == {("cup in view", "cup")}
     assert found["distance_m"] == 30.0
     assert found["filling"] is None
     assert "questions" not in found
@@ -378,6 +379,18 @@ def test_sightings_are_of_the_label_in_its_spellings_and_of_no_longer_word(tmp_p
         found = received(moment_reply(query, memory, Call()))
         assert [row["first_seen"] - BEGIN_S for row in found["sightings"]] == begins
         assert found["total"] == len(begins)
+
+
+def test_what_was_seen_has_each_label_once_however_often_another_one_was(tmp_path: Path) -> None:
+    """A person is in view for 15 s of each 45 s, 80 times, and for 2 s a cup, once."""
+    seen = ["person" if n % 45 < 15 else "" for n in range(80 * 45)]
+    seen[40 * 45 + 26 : 40 * 45 + 28] = ["cup", "cup"]
+    messages = [detections(BEGIN + n * S, [label] * bool(label)) for n, label in enumerate(seen)]
+    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    query = QueryParams(f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
+    found = received(moment_reply(query, memory, Call()))
+    rows = [(row["label"], row["t"] - BEGIN_S, row["end"] - BEGIN_S) for row in found["seen"]]
+    assert rows == [("person", 0, 14), ("cup", 1826, 1827)]
 
 
 def off_line(path: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -249,7 +249,7 @@ function always(reply, range) {
   const ends = [...gaps.map(([start]) => start), to];
   const spans = begins.map((t, n) => ({ t, end: ends[n] })).filter(({ t, end }) => t < end);
   return reply.throughout.flatMap((label) => spans.map(
-    (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
+    (span) => ({ kind: "thing", ...span, label, text: `${label} in view` })));
 }
 /* Whether an answer has all that was asked for, and that takes long. */
 function isWhole(reply, given) {

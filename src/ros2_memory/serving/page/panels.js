@@ -112,8 +112,7 @@ function eventRows(events, point) {
 function sightingRows(view, point, choose) {
   const { counts = {}, throughout = [] } = view;
   const always = new Set(throughout);
-  const some = view.events.filter((each) => each.kind === "thing"
-    && !always.has(each.text.replace(IN_VIEW, ""))).reverse();
+  const some = view.events.filter((each) => each.kind === "thing" && !always.has(each.label)).reverse();
   const all = throughout.map((label) => pair(link(`${label} in view`, () => choose(label)), "all the time"));
   const rows = [...all, ...eventRows(some, point)];
   const isWhole = (counts.sightings || 0) <= some.length;

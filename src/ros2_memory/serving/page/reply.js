@@ -4,7 +4,8 @@
    lane and `events` for the timeline, and `rows`: a text, its time `at` and how `long` (s) it took or
    what else is `beside` it, and what a click would `ask`. */
 
-const EVENTS = [["stop", /^stood at /], ["thing", / in view$/], ["silence", / (was|were) silent$/],
+const IN_VIEW = / in view$/;
+const EVENTS = [["stop", /^stood at /], ["thing", IN_VIEW], ["silence", / (was|were) silent$/],
   ["gap", /^nothing (was recorded|is here)/], ["error", /^error: /], ["clock step", /^the clock was set/],
   ["drop", /^slowed down suddenly/], ["failed goal", / goal (canceled|aborted)/], ["goal", / goal /],
   ["low battery", / (fell|was) below \d+%$/]];
@@ -71,7 +72,7 @@ function addEvents(part, events) {
     const end = long > 0 ? t + long : undefined;
     const said = whose(event) + text + within(event);
     const [, x, y] = STOOD.exec(text) || [];
-    part.events.push({ kind: eventKind(text), t, end, text });
+    part.events.push({ kind: eventKind(text), t, end, text, label: text.replace(IN_VIEW, "") });
     if (x !== undefined) part.points.push({ x: Number(x), y: Number(y), t, end, hint: `${said}, ${clock(t)}` });
     part.rows.push({ text: said, at: t, long, ask: during(t, end) });
   }

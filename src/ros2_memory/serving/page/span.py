@@ -100,7 +100,6 @@ MOST_SEEN: Final = 60
 MOST_SIGHTINGS: Final = 30
 _CHANGES_S: Final = 10.0
 """How long before a moment a change is shown."""
-_IN_VIEW: Final = " in view"
 
 
 def _unix_s(at: Ns) -> float:
@@ -114,6 +113,7 @@ EVENT: Final = keys(
     "kind",
     _TIME("t", "start"),
     "text",
+    PLAIN("label").if_any,
     _TIME("end").if_known,
     PLAIN("goes_on").if_any,
     _XY.spread("point").if_known,
@@ -520,13 +520,12 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
 
 
 def _seen(summary: Recap) -> list[JsonValue]:
-    """Returns the labels in view, each once; first those that were in view all the time."""
-    rows: dict[str, JsonObject] = {label: {"label": label} for label in summary.throughout}
-    for event in summary.events:
-        label = event.text.removesuffix(_IN_VIEW)
-        if event.kind == "thing" and label not in rows:
-            rows[label] = {**EVENT.render(event), "label": label}
-    return [*rows.values()]
+    """Returns the labels in view, each once; first those that were in view all the time.
+
+    Another label has its longest sight.
+    """
+    throughout: list[JsonValue] = [{"label": label} for label in summary.throughout]
+    return throughout + [EVENT.render(sight) for sight in summary.longest_sights]
 
 
 def sightings_shown(

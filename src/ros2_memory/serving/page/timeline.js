@@ -16,8 +16,6 @@ const WORST_LAST = ["accent", "good", "warn", "gap"];
 const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn", "low battery": "warn",
   silence: "warn", drop: "warn", flip: "accent", goal: "good" };
 
-const IN_VIEW = / in view$/;
-
 /* The labels that were in view, those seen longest first, each with the times: as they were counted,
    and by the events that came since. */
 function labelsOf(view) {
@@ -25,9 +23,8 @@ function labelsOf(view) {
   const bars = new Map(labels.map((each) => [each.label, each.bars.map(([t, end, text]) => ({ t, end, text }))]));
   for (const each of view.events) {
     if (each.kind !== "thing" || (each.end ?? each.t) <= until) continue;
-    const label = each.text.replace(IN_VIEW, "");
-    if (!bars.has(label)) bars.set(label, []);
-    bars.get(label).push(each);
+    if (!bars.has(each.label)) bars.set(each.label, []);
+    bars.get(each.label).push(each);
   }
   const rows = [...bars].map(([label, its]) => ({ label, bars: its.map((each) => (
     { kind: "thing", t: each.t, end: each.end ?? each.t, text: each.text ?? `${label} in view` })) }));
