@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord
+from ros2_memory.insights.saved_moments import fired_rules
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.rules import Rule, SplitSearch
@@ -158,6 +159,10 @@ class WatchedBags:
         state = TRIGGERS.read(self.bag_dir)
         assert state is not None
         return state.rules[name]
+
+    def problem(self, name: str = "bumper") -> str | None:
+        """The problem of a rule, as `memory_status` says it."""
+        return {each.name: each.problem for each in fired_rules(self.bag_dir)}[name]
 
     def moments(self) -> list[StoredMoment]:
         found = [*stored_moments_in(self.bag_dir).readable.values()]

@@ -790,7 +790,8 @@ class RuleRecord:
 
     Attributes:
         refused: how often it fired and no bag was kept.
-        problem: why it may have missed a match, or keeps nothing; None if it works.
+        problem: why it may have missed a match, or keeps nothing; None if it works. See also
+            `TriggerState.unread`.
         always_since: since when it has matched without an end; None unless that is long.
         begun: the log times at which the moments of the last hour began.
         newest: the moments that are not stored yet, and the newest one, in order.
@@ -834,12 +835,14 @@ class TriggerState:
         searched: the log time (excluded) up to which each part of the newest recordings was
             searched; see `triggers.rules.parts_of`.
         before: the newest recording that needs no search any more; None if there is none.
+        unread: why all rules may miss a match now: by split that cannot be read, a sentence.
     """
 
     rules: dict[str, RuleRecord] = field(default_factory=dict)
     searched: dict[str, Int64] = field(default_factory=dict)
     before: str | None = None
     latched: dict[str, LatchedMark] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
 
 
 TRIGGERS: Final = JsonDocument(TRIGGERS_FILE, TriggerState)

@@ -167,7 +167,8 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
         return ()  # the recorder reports that, and starts again
     if state is None:
         return ()
-    return tuple(FiredRule(name, rule) for name, rule in sorted(state.rules.items()))
+    unread = next(iter(state.unread.values()), None)
+    return tuple(FiredRule(name, rule, unread) for name, rule in sorted(state.rules.items()))
 
 
 def _now(memory: Memory, call: Call) -> Ns:

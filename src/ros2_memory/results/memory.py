@@ -211,13 +211,24 @@ class RememberedMoment:
     AGO("last_ago_s", "record.last_fired").if_known,
     PLAIN("refused", "record.refused").if_any,
     TIME("matches_since", "record.always_since").if_known,
-    PLAIN("problem", "record.problem").if_known,
+    PLAIN("problem").if_known,
 )
 class FiredRule:
-    """How often a rule of `recording.keep_when` fired, and how many moments that made."""
+    """How often a rule of `recording.keep_when` fired, and how many moments that made.
+
+    Attributes:
+        unread: why it may miss a match for as long as a split cannot be read; None if all can be.
+    """
 
     name: str
     record: RuleRecord
+    unread: str | None = None
+
+    @property
+    def problem(self) -> str | None:
+        """Why it may have missed a match, or may miss one now; None if it works."""
+        problems = dict.fromkeys([self.record.problem, self.unread])
+        return "; ".join(filter(None, problems)) or None
 
 
 def _size_gb(stored: StoredMoment) -> float:

@@ -14,12 +14,14 @@ import uuid
 from collections import defaultdict
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleMoment, RuleRecord, TriggerState
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
@@ -35,7 +37,7 @@ from ros2_memory.triggers.rules import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -49,6 +51,8 @@ LONGEST_NS: Final[Ns] = 600 * NS_PER_S
 """Matches join to moments that are no longer than this, or than one match needs."""
 MOST_WAITING: Final = 100
 """So many moments of a rule may wait to be stored."""
+MOST_UNREAD: Final = 100
+"""So many splits that cannot be read are remembered."""
 MOST_SEARCHED: Final = 64
 """So many recordings are remembered one by one; older ones were searched to their end."""
 
@@ -137,6 +141,8 @@ class Triggers:
         """Searches the closed bags for so long as a look may take; yields what fires."""
         deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
+        unread = self._unread_splits(snapshot, closed)
+        missed = self._missed_splits(snapshot, closed, state, unread)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
             found = self.search.search(chain, state, lambda: time.monotonic() > deadline)
             yield from found.firings
@@ -144,11 +150,43 @@ class Triggers:
                 state.searched[part] = max(min(window.stop, found.until), window.start)
             if not found.is_complete:
                 break
+        if snapshot.problem is not None:
+            return
+        if missed:
+            for record in state.rules.values():
+                record.problem = record.problem or state.unread[missed[0]]
+        state.unread = dict(islice(unread.items(), MOST_UNREAD))
+
+    def _unread_splits(self, snapshot: Snapshot, parts: Iterable[str]) -> dict[str, str]:
+        """Returns the splits that cannot be read, each with a sentence that says so."""
+        names = {*map(recording_of, parts)}
+        unread: dict[str, str] = {}
         for aside in snapshot.damaged:
-            if self.own.name_of(aside.path.parent) in map(recording_of, closed):
-                for record in state.rules.values():
-                    problem = f"not all could be searched: {aside.path.name}: {aside.reason}"
-                    record.problem = record.problem or problem
+            if self.own.name_of(aside.path.parent) in names:
+                problem = f"not all could be searched: {aside.path.name}: {aside.reason}"
+                unread[self.own.name_of(aside.path)] = problem
+        return unread
+
+    def _missed_splits(
+        self,
+        snapshot: Snapshot,
+        closed: Mapping[str, Iterable[BagFile]],
+        state: TriggerState,
+        unread: Collection[str],
+    ) -> list[str]:
+        """Returns the splits that could not be read before, and will never be searched.
+
+        They are not there any more, or the search of their part is beyond them.
+        """
+        no_longer = [split for split in state.unread if split not in unread]
+        if not no_longer:
+            return []
+        paths = [*snapshot.empty, *(aside.path for aside in snapshot.active)]
+        for part, bags in closed.items():
+            reached = state.searched.get(part, MIN_NS) - OUT_OF_ORDER_NS
+            paths += [bag.path for bag in bags if bag.start >= reached]
+        searchable = {*map(self.own.name_of, paths)}
+        return [split for split in no_longer if split not in searchable]
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that are not searched, and those before that a match may save."""

@@ -97,7 +97,7 @@ RULES = r"""{"format":1,"rules":{"t\u00fcr":{"fired":1,"moments":2,"refused":3,"
 "problem":"\u00df","always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
 "start":1,"end":2,"matches":1,"known":false,"stored":false}],
 "runs":{"/a":{"first":1,"last":2,"fired":false,"lasts":false}}}},"searched":{"\udcff":1},"before":"x",
-"latched":{"/m":{"published":{"a":1},"begun":{"a":2},"payload":"ff"}}}"""
+"latched":{"/m":{"published":{"a":1},"begun":{"a":2},"payload":"ff"}},"unread":{"\udcff":"\u00df"}}"""
 DOCUMENTS: list[tuple[Document, str]] = [
     (ERASING, ERASURE.replace("\n", "")),
     (SCREENED, SCREEN.replace("\n", "")),

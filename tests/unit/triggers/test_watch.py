@@ -35,6 +35,12 @@ def robot(tmp_path: Path) -> WatchedBags:
     return watched(tmp_path)
 
 
+def fail_to_summarize(monkeypatch: pytest.MonkeyPatch, *bags: Path) -> None:
+    reason = "it cannot be opened or read: Input/output error"
+    faults = {bag: BagUnreachableError(str(bag), reason) for bag in bags}
+    fail_reading(monkeypatch, "summarize", faults.get)
+
+
 def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
     return [flag(n, n in true_at) for n in range(begin, stop)]
 
@@ -331,16 +337,79 @@ def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
     robot.look()
     bad = robot.split(seconds(10, 20, {15}))
     with monkeypatch.context() as failing:
-        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
-        fail_reading(failing, "summarize", lambda path: fault if path == bad else None)
+        fail_to_summarize(failing, bad)
         for begin in (20, 30, 40):
             robot.split(seconds(begin, begin + 10, {begin + 2}))
             robot.clock.at = T0 + (begin + 10) * S
             robot.look()
-        assert bad.name in (robot.record().problem or "")
+        assert bad.name in (robot.problem() or "")
     robot.clock.at = T0 + 300 * S
     robot.close_all()
     assert [(at - T0) // S for at in robot.fired_at()] == [15, 22, 32, 42]
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_a_split_that_cannot_be_read_is_a_problem_only_until_it_can_be(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch, is_restarted: bool
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.look()
+    with monkeypatch.context() as failing:
+        first = robot.split(seconds(10, 20))
+        second = robot.split([])  # it has no message, which shows only once it can be read
+        fail_to_summarize(failing, first, second)
+        robot.split(seconds(30, 40))
+        robot.clock.at = T0 + 40 * S
+        robot.look()
+        assert first.name in (robot.problem() or "")
+    with monkeypatch.context() as failing:
+        fail_to_summarize(failing, second)
+        robot.clock.at = T0 + 300 * S
+        robot.look()
+        assert second.name in (robot.problem() or "")
+    if is_restarted:
+        robot.house = robot.new_house()
+    robot.clock.at = T0 + 600 * S
+    robot.look()
+    assert robot.problem() is None
+
+
+def test_a_split_that_was_deleted_before_it_could_be_read_stays_a_problem(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.look()
+    lost = robot.split(seconds(10, 20, {15}))
+    fail_to_summarize(monkeypatch, lost)
+    robot.split(seconds(20, 30))
+    robot.clock.at = T0 + 30 * S
+    robot.look()
+    lost.unlink()
+    other = robot.split(seconds(30, 40))
+    fail_to_summarize(monkeypatch, other)
+    robot.split(seconds(40, 50))
+    robot.clock.at = T0 + 60 * S
+    robot.look()
+    said = robot.problem() or ""
+    assert (lost.name in said, other.name in said) == (True, True)
+
+
+def test_a_first_split_that_is_readable_too_late_stays_a_problem(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    with monkeypatch.context() as failing:
+        first = robot.split(seconds(0, 10, {5}))
+        fail_to_summarize(failing, first)
+        robot.split(seconds(10, 20))
+        robot.clock.at = T0 + 20 * S
+        robot.look()
+    robot.clock.at = T0 + 300 * S
+    robot.close_all()
+    assert robot.fired_at() == []
+    assert first.name in (robot.problem() or "")
 
 
 def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> None:
