@@ -61,7 +61,9 @@ _log = get_logger(__name__)
 
 @dataclass(eq=False, repr=False)
 class Triggers:
-    """The rules of one bag directory. Not thread-safe, except for `note_restart`.
+    """The rules of one bag directory.
+
+    Not thread-safe, except for `note_restart` and `note_deleted`.
 
     Args:
         rules: the rules, with unique names.
