@@ -226,8 +226,8 @@ class FiredRule:
 
     @property
     def problem(self) -> str | None:
-        """Why it may have missed a match, or may miss one now; None if it works."""
-        problems = dict.fromkeys([self.record.problem, self.unread])
+        """Why it may have missed a match, or stores or searches nothing now; None if it works."""
+        problems = dict.fromkeys([self.record.problem, self.record.unstored, self.unread])
         return "; ".join(filter(None, problems)) or None
 
 

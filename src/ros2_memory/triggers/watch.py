@@ -357,6 +357,7 @@ class _RuleLook:
         The next match may extend the newest moment.
         """
         record = self.record
+        record.unstored = None
         left = [moment for moment in record.newest if moment.stored or self._store(moment)]
         record.newest = [moment for moment in left[:-1] if not moment.stored] + left[-1:]
 
@@ -370,9 +371,8 @@ class _RuleLook:
             keep = self.triggers.moments.keep_for_rule
             refused = keep(request, name, moment.matches, self.snapshot)
         except OSError as error:
-            self._report(
-                Refusal("disk", f"its moments cannot be stored: {error.strerror or error}")
-            )
+            record.unstored = f"its moments cannot be stored: {error.strerror or error}"
+            self._report(Refusal("disk", record.unstored))
             return True
         moment.stored = True
         if refused is not None:
@@ -388,13 +388,13 @@ class _RuleLook:
 
     def _refuse(self, refusal: Refusal) -> None:
         self.record.refused += 1
+        self.record.problem = refusal.sentence
         self._report(refusal)
 
     def _report(self, refusal: Refusal) -> None:
-        """Stores why the rule saves nothing, and logs each kind once for as long as it goes on."""
+        """Logs why the rule saves nothing, each kind once for as long as it goes on."""
         if refusal.kind not in self._reported_recently():
             _log.warning("trigger_not_kept", rule=self.rule.name, reason=refusal.sentence)
-        self.record.problem = refusal.sentence
         self.triggers.reported[self.rule.name][refusal.kind] = self.record.last_fired or 0
 
     def _reported_recently(self) -> set[str]:

@@ -466,6 +466,18 @@ def test_a_state_that_is_damaged_is_said_to_be_lost(tmp_path: Path) -> None:
     assert robot.record().problem == said["reason"]
 
 
+def test_moments_that_cannot_be_stored_are_a_problem_until_they_are(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10, {5}))
+    moments = robot.bag_dir / "moments"
+    moments.symlink_to(robot.bag_dir.parent)
+    robot.close_all()
+    assert "cannot be stored" in (robot.problem() or "")
+    moments.unlink()
+    robot.look()
+    assert (robot.spans(), robot.problem()) == ([(0, 8)], None)
+
+
 @pytest.mark.parametrize("field", ["missing", "x"])
 def test_a_condition_that_nothing_can_meet_is_named(tmp_path: Path, field: str) -> None:
     robot = watched(tmp_path, rule(condition=parse_condition("equals", True, 0.5, field)))
