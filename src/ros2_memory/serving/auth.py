@@ -62,8 +62,8 @@ _SCHEME: Final = b"bearer "
 _REFUSED: Final = -32_001
 """The code of a JSON-RPC error that a server defines itself."""
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
-_QUESTIONS: Final = ("/sse", "/messages/", MCP_PATH)
-"""The paths that a limited token may use, or their beginnings."""
+_QUESTIONS: Final = frozenset({"/sse", "/messages", MCP_PATH})
+"""The paths that a limited token may use, with or without a slash at their end."""
 _FORBIDDEN: Final = PlainTextResponse(
     "The token is for questions about some robots alone.\n", status_code=403
 )
@@ -137,7 +137,7 @@ class TokenGate:
             if not is_health or given:
                 self._log_refused(scope, is_wrong=bool(given))
                 app = _unauthorized(is_wrong=bool(given), speaks_mcp=path == MCP_PATH)
-        elif access.robots is None or path.startswith(_QUESTIONS):
+        elif access.robots is None or path.removesuffix("/") in _QUESTIONS:
             admit(scope, access)
         elif not is_health:
             app = _FORBIDDEN

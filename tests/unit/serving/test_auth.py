@@ -116,6 +116,22 @@ async def test_nothing_but_health_is_open(path: str) -> None:
     assert inside.seen == []
 
 
+@pytest.mark.parametrize(
+    ("path", "is_open"),
+    [("/mcp", True), ("/mcp/", True), ("/sse", True), ("/messages/", True), ("/health", True)]
+    + [("/mcp-admin", False), ("/sse/x", False), ("/messages/x", False), ("/metrics", False)],
+)
+async def test_a_token_for_some_robots_opens_the_paths_of_questions_alone(
+    path: str, is_open: bool
+) -> None:
+    inside = Inside()
+    transport = httpx2.ASGITransport(app=TokenGate(inside, {GOOD: frozenset({"r1"})}))
+    async with httpx2.AsyncClient(transport=transport, base_url="http://robot") as http:
+        response = await http.get(path, headers={"authorization": f"Bearer {GOOD}"})
+    assert response.status_code == (200 if is_open else 403)
+    assert len(inside.seen) == is_open
+
+
 @given(st.binary(max_size=80))
 async def test_no_other_bytes_open_it(shown: bytes) -> None:
     inside = Inside()
