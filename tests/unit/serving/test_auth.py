@@ -118,8 +118,10 @@ async def test_nothing_but_health_is_open(path: str) -> None:
 
 @pytest.mark.parametrize(
     ("path", "is_open"),
-    [("/mcp", True), ("/mcp/", True), ("/sse", True), ("/messages/", True), ("/health", True)]
-    + [("/mcp-admin", False), ("/sse/x", False), ("/messages/x", False), ("/metrics", False)],
+    [
+        *((path, True) for path in ("/mcp", "/mcp/", "/sse", "/messages/", "/health")),
+        *((path, False) for path in ("/mcp-admin", "/sse/x", "/messages/x", "/metrics")),
+    ],
 )
 async def test_a_token_for_some_robots_opens_the_paths_of_questions_alone(
     path: str, is_open: bool
