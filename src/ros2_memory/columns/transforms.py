@@ -15,7 +15,7 @@ from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.pack import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
-from ros2_memory.core.arrays import concatenated, distinct_rows
+from ros2_memory.core.arrays import concatenated, distinct, distinct_rows
 from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntAr
             numbers = np.column_stack((edge.translation, edge.rotation))
             is_new[1:] = (numbers[1:] != numbers[:-1]).any(axis=1)
         changes.append(edge.log_times[is_new])
-    return np.unique(concatenated(changes))
+    return distinct(concatenated(changes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +170,7 @@ def stamped_between(
     if transforms is None:
         return None
     stamps = np.asarray(transforms.columns[_STAMP], np.int64)
-    rows = np.unique(transforms.owners[(stamps >= earliest) & (stamps <= latest)])
+    rows = distinct(transforms.owners[(stamps >= earliest) & (stamps <= latest)])
     return rows if index is None else np.flatnonzero(np.isin(index, rows))
 
 

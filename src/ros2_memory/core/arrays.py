@@ -147,6 +147,15 @@ def run_starts(*columns: Ints | Flags) -> Ints:
     return np.flatnonzero(is_other)
 
 
+def distinct(values: Ints) -> Ints:
+    """Returns the distinct values in order.
+
+    If most values differ and are in order, `numpy.unique` takes fifty times as long.
+    """
+    ordered = np.sort(values, kind="stable")
+    return ordered[run_starts(ordered)]
+
+
 def runs_where(marks: Flags, *columns: Ints) -> Ints:
     """Returns where each run of equal rows that are marked begins and stops: rows of two."""
     starts = run_starts(marks, *columns)

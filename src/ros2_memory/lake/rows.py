@@ -36,6 +36,7 @@ from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses, positions_
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.columns.writing import PART_NS
+from ros2_memory.core.arrays import distinct
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
@@ -356,7 +357,7 @@ class RowMaker:
             by_channel[id(channel)].add(batch)
             _drop_payloads(by_channel.values())
         order = sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
-        times = [np.unique(np.concatenate(messages.parts, 1)[0]) for messages in order]
+        times = [distinct(np.concatenate(messages.parts, 1)[0]) for messages in order]
         none = np.empty(0, np.int64)
         log_times, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
         tied = log_times[channels > 1]

@@ -32,6 +32,7 @@ from ros2_memory.core.arrays import (
     Groups,
     Ints,
     begins_of,
+    distinct,
     distinct_rows,
     in_ranges,
     narrowed,
@@ -332,7 +333,7 @@ def evidence_at(
     # All looks from cells that see the place, and from other cells the looks in slices with hits: a
     # robot in its dock has ten thousands of looks at each place with one false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
-    beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
+    beside = cells.looks_during(distinct(np.concatenate((hit_slices, blind))))
     cell, has_hits = places_among(cells.cells_of(beside), hit_cells)
     looks_in = cells.looks_in[_number(hit_cells[sees])]
     cell = np.concatenate((cell[has_hits], np.repeat(np.flatnonzero(sees), looks_in)))
@@ -392,12 +393,6 @@ def _place(keys: Ints) -> Ints:
 
 def _number(keys: Ints) -> Ints:
     return keys & ((1 << _BITS) - 1)
-
-
-def _distinct(keys: Ints) -> Ints:
-    """Returns the distinct keys in order. `numpy.unique` is slower if most are in order."""
-    ordered = np.sort(keys, kind="stable")
-    return ordered[np.diff(ordered, prepend=-1) > 0]
 
 
 def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
@@ -500,7 +495,7 @@ class _SliceEvidence(NamedTuple):
 
 def _slice_evidence(cells: Cells, evidence: Evidence) -> _SliceEvidence:
     looks = _keys(_place(evidence.looks), cells.slice[_number(evidence.looks)])
-    slices = _distinct(np.concatenate((looks, evidence.blind)))
+    slices = distinct(np.concatenate((looks, evidence.blind)))
     slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
     hit = np.flatnonzero(evidence.hits)  # a few of all looks
     weights = evidence.hits[hit], evidence.hits[hit] * evidence.sees[hit], evidence.n[hit]
