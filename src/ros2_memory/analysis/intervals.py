@@ -246,7 +246,7 @@ def united_tables(
     """Returns when objects were visible by any of several tables, as of topics.
 
     Intervals of one label are joined that overlap. So are those that go on in the next table, if
-    `follows` says of that table that it follows the one before without a silence.
+    `follows` is true for that table: no silence parts it from the one before.
     """
     is_next = np.array(follows or np.zeros(len(tables)), np.bool_)
     rows = np.frombuffer(b"".join([table.rows for table in tables]), ROW)

@@ -93,7 +93,7 @@ _Kind: TypeAlias = Literal[
 ]
 """The lists of `ComparedThings`, or "same"."""
 _Numbers: TypeAlias = defaultdict[tuple[str, str], float]
-"""Numbers above 0 by the name of what is counted, and by the topic that says so."""
+"""Numbers above 0 by the name of the fact that they count, and by its topic."""
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}

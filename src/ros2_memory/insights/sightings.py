@@ -84,7 +84,7 @@ def find_matches(
     frame_id: str | None = None,
     beside: str | None = None,
 ) -> Sightings:
-    """Returns the newest `limit` sightings of what is sought, newest first.
+    """Returns the newest `limit` sightings that meet the condition, newest first.
 
     On a topic of texts that hold until the next one they are episodes (`insights.episodes`).
 

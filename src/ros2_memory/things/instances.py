@@ -193,7 +193,7 @@ class Estimate:
     unplaced_of: dict[str, Ints]
     """The rows of `unplaced` of each key."""
     crowded: frozenset[str]
-    """The names of what is at so many places that some are left out."""
+    """The names of things that have too many places: some places are left out."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
     """For each spot, the number of the first stay that has it; -1 for none."""

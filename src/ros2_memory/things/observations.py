@@ -1,11 +1,10 @@
 """Which detections count, and from where they were seen: what is computed once for all labels.
 
-Those with a low score do not count.
-
-Nor do those of carried things: a thing in a gripper, or on a tray, moves with the robot. While the
-robot drives, such a thing stays at one place in the robot's frame, and is at a new one in the map
-each time. None of these is a place of the thing: the robot only passed there with it. A part of the
-robot that a detector takes for a thing looks the same.
+Detections with a low score do not count. Nor do those of carried things: a thing in a gripper, or
+on a tray, moves with the robot. While the robot drives, such a thing stays at one place in the
+robot's frame, and is at a new one in the map each time. None of these is a place of the thing: the
+robot only passed there with it. A part of the robot that a detector takes for a thing looks the
+same.
 
 When localisation was poor, a detection is not where it seems to be: it moves nothing. Localisation
 is poor while the localiser's covariance is large, and for some seconds before the map jumps under
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Fix, Floats, Hit, Look, Score, Spot
-from ros2_memory.core.arrays import Columns, Flags, Ints, run_starts, stable_order
+from ros2_memory.core.arrays import Columns, Flags, Ints, run_starts, runs_where, stable_order
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.instances import Tally
 from ros2_memory.things.labels import moves_by_itself
@@ -160,9 +159,8 @@ def _carried_spots(sights: JoinedSights) -> Flags:
     is_step &= np.abs(place[after] - place[before]) >= _STEP_MM
     is_step &= np.abs(ahead[after] - ahead[before]) <= _SAME_MM
     # Runs of steps: a run of n steps has n + 1 spots.
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], is_step, [False]))))
     carried: Flags = np.zeros(len(spots), np.bool_)
-    for begin, end in edges.reshape(-1, 2).tolist():
+    for begin, end in runs_where(is_step).tolist():
         if end - begin + 1 >= _FEWEST_CARRIED:
             carried[may_be[order[begin : end + 1]]] = True
     return carried

@@ -113,7 +113,7 @@ class _LabelDetections(NamedTuple):
     Attributes:
         name: the name to show.
         spots: rows of `Spot`; `counts` has how many detections of each count.
-        is_carried: which spots are of what the robot carried.
+        is_carried: which spots are of carried things.
         lost: the detections without a place, as rows of `Unplaced`.
     """
 

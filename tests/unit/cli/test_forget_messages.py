@@ -11,7 +11,7 @@ import shutil
 import sqlite3
 import subprocess
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -378,19 +378,27 @@ def test_the_time_in_a_place_goes_with_a_second_on_either_side(
     assert traces(home, f"{SAID} 70")
 
 
-def test_of_a_place_what_was_recorded_while_nobody_knew_where_the_robot_was_is_said_to_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
-) -> None:
-    """The odometry is silent for 40 s, the camera is not."""
+def home_with_a_bathroom(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: Iterable[Msg]
+) -> Path:
+    """A robot's own bag with these messages, which commands use; returns the file of places."""
     home, places = tmp_path / "home", tmp_path / "places.yaml"
-    body = [odom(T0 + n * S, n, 0.0) for n in range(60) if not 10 < n < 50]
-    body += [text(T0 + n * S + 7, f"{SAID} {n:02}", CAMERA) for n in range(60)]
     left(write_mcap(home / "rec_h" / "rec_h_0.mcap", body))
     own_all(home)
     places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
     monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return places
+
+
+def test_of_a_place_what_was_recorded_while_nobody_knew_where_the_robot_was_is_said_to_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+) -> None:
+    """The odometry is silent for 40 s, the camera is not."""
+    body = [odom(T0 + n * S, n, 0.0) for n in range(60) if not 10 < n < 50]
+    body += [text(T0 + n * S + 7, f"{SAID} {n:02}", CAMERA) for n in range(60)]
+    places = home_with_a_bathroom(tmp_path, monkeypatch, body)
     shown = forget(1, 0, 100, f"--yes --where bathroom data.places_file={places}").out
     unknown = f"from {T0 // S + 10}.000001 to {T0 // S + 50}.000000 (40 s)"
     assert f"what is not known: where the robot was is not known {unknown}" in shown
@@ -400,15 +408,9 @@ def test_of_a_place_nothing_stays_because_the_clock_was_set_ahead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
 ) -> None:
     """The robot drives on while the clock skips 8 s, of which nothing can have been recorded."""
-    home, places = tmp_path / "home", tmp_path / "places.yaml"
     body = [odom(T0 + n * S // 10 + 8 * S * (n >= 305), n / 20, 0.0) for n in range(600)]
     body += [text(T0 + n * S + 8 * S * (n > 30) + 7, SAID, CAMERA) for n in range(60)]
-    left(write_mcap(home / "rec_h" / "rec_h_0.mcap", body))
-    own_all(home)
-    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    places = home_with_a_bathroom(tmp_path, monkeypatch, body)
     shown = forget(0, 0, 100, f"--yes --where bathroom data.places_file={places}").out
     assert "what is not known" not in shown
 
