@@ -38,7 +38,7 @@ from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.json_files import state_path
 from ros2_memory.core.directories import mode_of
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.model import BAG_KINDS, COMPRESSED
+from ros2_memory.core.model import BAG_KINDS, COMPRESSED, MCAP
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -181,12 +181,12 @@ def has_own_name(name: str) -> bool:
 
 def split_name(recording: str, number: int) -> str:
     """Returns the name that `ros2 bag record` gives a split of a recording."""
-    return f"{recording.rpartition('/')[2]}_{number}.mcap"
+    return f"{recording.rpartition('/')[2]}_{number}{MCAP}"
 
 
 def split_number(recording: str, file: str) -> int | None:
     """Returns the number of a split of a recording, by its name; None of other files."""
-    digits = file.removesuffix(".mcap").rpartition("_")[2]
+    digits = file.removesuffix(MCAP).rpartition("_")[2]
     if not digits.isdecimal() or file != split_name(recording, int(digits)):
         return None
     return int(digits)

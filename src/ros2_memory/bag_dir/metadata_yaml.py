@@ -21,7 +21,7 @@ import yaml
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, bags_in, split_number
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.model import COMPRESSED
+from ros2_memory.core.model import COMPRESSED, MCAP, SQLITE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, Channel
 
 _MAX_BYTES: Final = 64 << 20
-_STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
+_STORAGES: Final = {"mcap": MCAP, "sqlite3": SQLITE}
 _ROOT: Final = "rosbag2_bagfile_information"
 # Patterns: a YAML parser takes 0.8 s for the list of a day of splits (8640 files). They do not
 # backtrack: a line may have thousands of spaces.

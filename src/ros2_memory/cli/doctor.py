@@ -31,7 +31,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     UndecodableError,
 )
-from ros2_memory.core.model import BagFile, BagState, SetAside
+from ros2_memory.core.model import MCAP, BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -364,7 +364,7 @@ def _remedy(file: SetAside, memory: Memory) -> str:
     if not os.access(file.path, os.R_OK):
         return _READ
     with suppress(BagError):
-        if file.path.suffix == ".mcap" and memory.reader.closing(file.path) is Closing.OPEN:
+        if file.path.suffix == MCAP and memory.reader.closing(file.path) is Closing.OPEN:
             return f"ros2-memory recover {shlex.quote(str(memory.index.bag_dir))}"
     return "copy them again from their source; what is so there, too, cannot be read"
 

@@ -22,7 +22,7 @@ from ros2_memory.cli.output import print_json, print_line, print_notes, spinner
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import MCAP, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.text import counted, listed
@@ -79,7 +79,7 @@ def prove(
     read, parts, definitions = log.spans(), _parts_without_gaps(view), Definitions(memory.reader)
     own_settings = [word for word in bags.words or () if not is_folder(word)]
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
-        attempts = _spans_to_copy(view, read, parts, in_one_file=output.suffix == ".mcap")
+        attempts = _spans_to_copy(view, read, parts, in_one_file=output.suffix == MCAP)
         for number, spans in enumerate(attempts):
             path = Path(folder) / str(number) / output.name
             path.parent.mkdir()
@@ -98,7 +98,7 @@ def prove(
     verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
     if differing:
         verdict = f"over {output} the answer differs in {listed(differing)}"
-        if len(parts) > 1 and output.suffix == ".mcap":
+        if len(parts) > 1 and output.suffix == MCAP:
             verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
     print(verdict, file=sys.stderr)
     if definitions.undefined:
@@ -230,7 +230,7 @@ def _write_copy(
 
     A path that ends in `.mcap` becomes one file, any other one a folder with a file for each part.
     """
-    if path.suffix == ".mcap":
+    if path.suffix == MCAP:
         messages = _messages_in(view, spans, TimeWindow.everything())
         with suppress(NoDataError):
             return write_mcap(path, definitions.add_to(messages))
@@ -241,7 +241,7 @@ def _write_copy(
         folder.mkdir(parents=True, exist_ok=True)
         messages = filter(part.has, _messages_in(view, spans, part.window))
         with suppress(NoDataError):  # all messages of the part are copies of another recording's
-            file = folder / (part.derived or f"{part.recording.name}_{number}.mcap")
+            file = folder / (part.derived or f"{part.recording.name}_{number}{MCAP}")
             count += write_mcap(file, definitions.add_to(messages))
     return count
 

@@ -51,7 +51,7 @@ from ros2_memory.config import (
 )
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import MCAP, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import Ns, iso_local, unix_from_ns
 from ros2_memory.recorder.process.child import Child, Patience, end_all
@@ -514,7 +514,7 @@ def _record(
         status = child.exit_status()
     finally:
         end_all([child])
-    file = next(directory.glob("*.mcap"), None)
+    file = next(directory.glob(f"*{MCAP}"), None)
     if status is not None or file is None:
         words = "; ".join([*lines, *child.take_lines()][-3:])
         raise RecorderError(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.core.arrays import concatenated, places_among, stable_order
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.model import MCAP, BagFile, BagState, TimeWindow
 from ros2_memory.index.bag_rows import Bags
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def _covered_segment(segment: Segment, stored: StoredBags) -> CoveredSegment:
     can_be_stored = bags.in_state(BagState.CLOSED)
     left_open = np.flatnonzero(bags.in_state(BagState.INCOMPLETE))
     # A database goes on in its journal, which may change while its own file does not.
-    can_be_stored[left_open] = [file.endswith(".mcap") for file in bags.files(left_open)]
+    can_be_stored[left_open] = [file.endswith(MCAP) for file in bags.files(left_open)]
     is_stored: Mask = can_be_stored & (stored.numbers >= 0)
     numbers = np.where(is_stored, stored.numbers, -1)
     return CoveredSegment(segment, numbers, is_stored & stored.hashed, can_be_stored & ~is_stored)

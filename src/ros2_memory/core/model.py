@@ -28,8 +28,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.bag_summary import BagSummary
 
-PLAIN_KINDS: Final = (".mcap", ".db3")
-UNMARKED_KINDS: Final = frozenset({".db3"})
+MCAP: Final = ".mcap"
+SQLITE: Final = ".db3"
+PLAIN_KINDS: Final = (MCAP, SQLITE)
+UNMARKED_KINDS: Final = frozenset({SQLITE})
 """Kinds whose files do not show whether their writer has finished."""
 COMPRESSED: Final = ".zstd"
 BAG_KINDS: Final = (*PLAIN_KINDS, *(f"{kind}{COMPRESSED}" for kind in PLAIN_KINDS))

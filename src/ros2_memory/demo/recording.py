@@ -15,6 +15,7 @@ import yaml
 
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import MCAP
 from ros2_memory.core.timebase import Clock, WallClock, ns_from_unix, unix_from_ns
 from ros2_memory.demo.messages import MessageSchedule, Stream, definition, payload
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -77,7 +78,7 @@ class DemoRecorder:
         writer = McapWriter()
         try:
             while not self._ending.is_set():
-                file = self.directory / f"{self.directory.name}_{self.splits}.mcap"
+                file = self.directory / f"{self.directory.name}_{self.splits}{MCAP}"
                 self.splits += 1
                 writer.write(file, self._split())
         except BagError as error:

@@ -41,7 +41,7 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
 from ros2_memory.bag_dir.state_files import Withheld, read_withheld
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.core.model import UNMARKED_KINDS, BagFile, BagState, SetAside
+from ros2_memory.core.model import MCAP, UNMARKED_KINDS, BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 from ros2_memory.storage.base import BagReader, Closing
@@ -309,7 +309,7 @@ def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) 
     """
     is_growing = notes.was_seen_growing(context) or context.names(notes.path)
     aside = SetAside(notes.path, _ACTIVE, growing=is_growing)
-    if not context.include_active or notes.kind != ".mcap":
+    if not context.include_active or notes.kind != MCAP:
         return Classification(FileState.ACTIVE, aside=aside)
     summary = _summary_so_far(notes, reader)
     if summary is None and notes.stamp.size:
@@ -348,7 +348,7 @@ def _classify_readable(notes: FileNotes, summary: BagSummary) -> Classification:
             return Classification(FileState.EMPTY, silent=summary.schema.silent)
         if is_closed:
             return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
-        closes = _RECOVER if notes.kind == ".mcap" else ""
+        closes = _RECOVER if notes.kind == MCAP else ""
         return _set_aside(FileState.DAMAGED, notes, _NO_MESSAGE + closes)
     bag = _bag_file(notes, BagState.CLOSED if is_closed else BagState.INCOMPLETE, summary)
     return Classification(FileState.CLOSED if is_closed else FileState.INCOMPLETE, bag=bag)

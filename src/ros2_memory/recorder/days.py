@@ -42,7 +42,7 @@ from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.model import MCAP, BagFile, TimeWindow
 from ros2_memory.core.text import (
     LABELS,
     LISTS_OF_LABELS,
@@ -351,7 +351,7 @@ class MemoryDays:
         """Returns the files of days that the recorder wrote, oldest first. Follows no link."""
         if self._folder.is_symlink() or not self._folder.is_dir():
             return []
-        paths = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
+        paths = [path for path in self._folder.glob(f"*{MCAP}") if not path.is_symlink()]
         own = (path for path in paths if self.own.owns_bag(path))
         # The numbered files of a day, whose names are longer, are newer than its first one.
         return sorted(own, key=lambda path: (_day_of(path), len(path.name), path))

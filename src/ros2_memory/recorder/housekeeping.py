@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, app
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import MCAP, BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_HOUR, Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
@@ -44,7 +44,6 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 """A larger file would delay deletion by minutes; `ros2-memory recover` repairs it."""
 
 _MB: Final = 10**6
-_MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
 """So many steps of screening a recorder that stops still does."""
 _WRITTEN_AT_ONCE: Final = 2
@@ -415,7 +414,7 @@ class Housekeeping:
                 continue
             if (path, status.st_size, status.st_mtime_ns) in self._tried:
                 continue
-            if path.suffix != _MCAP or path.parent in named or is_saved(self.bag_dir, str(path)):
+            if path.suffix != MCAP or path.parent in named or is_saved(self.bag_dir, str(path)):
                 continue
             if self._may_repair(path, status):
                 yield path, status

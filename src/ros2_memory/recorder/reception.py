@@ -19,6 +19,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.model import MCAP
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.recorder.measure import (
@@ -446,6 +447,6 @@ def newest_splits(bag_dir: Path) -> list[Path]:
     with suppress(OSError):
         folders = sorted(folder for folder in bag_dir.iterdir() if has_own_name(folder.name))
         for folder in [*filter(is_folder, folders)][-_NEWEST_SPLITS:]:
-            splits = sorted(folder.glob("*.mcap"), key=lambda split: split.lstat().st_mtime_ns)
+            splits = sorted(folder.glob(f"*{MCAP}"), key=lambda split: split.lstat().st_mtime_ns)
             newest += filter(size_of, splits)
     return newest[-_NEWEST_SPLITS:]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import RECORDING_FILES, bag_kind
 from ros2_memory.core import directories
+from ros2_memory.core.model import SQLITE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -69,7 +70,7 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
             reason = "it is not the file that was looked at"
             raise OSError(errno.ESTALE, reason, str(path))
         os.unlink(path.name, dir_fd=directory)
-        if path.suffix.lower() == ".db3":
+        if path.suffix.lower() == SQLITE:
             for suffix in _JOURNALS:
                 with suppress(FileNotFoundError, IsADirectoryError):
                     os.unlink(path.name + suffix, dir_fd=directory)

@@ -33,7 +33,7 @@ from ros2_memory.bag_dir.moment_file import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.model import MCAP, BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any, united, without
 from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.retention.delete import size_of
@@ -83,7 +83,7 @@ def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
     for bag in snapshot.timeline.overlapping(window):
         if not bag.reaches_into(window) or is_derived(bag.file):
             continue
-        unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
+        unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(MCAP)
         if unfinished and now - moment.asked < REPAIRED_WITHIN_NS:
             waits = True
         else:

@@ -24,6 +24,7 @@ from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.model import MCAP
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
@@ -159,7 +160,7 @@ class TopicCutter:
         return [
             TopicCut(bag, frozenset(going[bag.file]))
             for bag in snapshot.bags
-            if bag.file in going and bag.path.suffix == ".mcap"
+            if bag.file in going and bag.path.suffix == MCAP
         ]
 
     def _may_begin(self, waiting: Sequence[TopicCut]) -> bool:

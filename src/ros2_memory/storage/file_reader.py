@@ -12,7 +12,7 @@ from rosbags.serde.utils import SIZEMAP
 
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.core.model import BAG_KINDS, COMPRESSED
+from ros2_memory.core.model import BAG_KINDS, COMPRESSED, MCAP, SQLITE
 from ros2_memory.storage.base import SEQUENCE, BagReader, Batch, Channel, Definition, Record
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
@@ -209,8 +209,8 @@ class FileReader(BagReader):
         self._decoders: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
         self._large = large
         self._formats: dict[str, McapBags | SqliteBags] = {
-            ".mcap": McapBags(cache_mb, max_chunk_mb, large),
-            ".db3": SqliteBags(max_chunk_mb, large),
+            MCAP: McapBags(cache_mb, max_chunk_mb, large),
+            SQLITE: SqliteBags(max_chunk_mb, large),
         }
         self._scratch = Scratch(unpack_max_mb << 20)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ros2_memory.core.model import MCAP
 from ros2_memory.storage.file_reader import FileReader
 
 if TYPE_CHECKING:
@@ -15,4 +16,4 @@ class McapReader(FileReader):
 
     def reads(self, path: Path) -> bool:
         """Returns whether the name ends with `.mcap`."""
-        return path.suffix == ".mcap"
+        return path.suffix == MCAP

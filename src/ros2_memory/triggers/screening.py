@@ -39,7 +39,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
 from ros2_memory.core.errors import BagError, EpisodicError, RecorderError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import MCAP, TimeWindow
 from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
@@ -310,7 +310,7 @@ class Screening:
             _UselessRuleError: a rule excludes times of unknown state, and no message has ever shown
                 whether it holds; the state is unchanged.
         """
-        if path.suffix != ".mcap" or not summary.complete:
+        if path.suffix != MCAP or not summary.complete:
             raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return

@@ -58,7 +58,7 @@ from ros2_memory.cli.output import format_size, format_time, print_line, spinner
 from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import BagError, InvalidArgumentsError, RecorderError
-from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.model import MCAP, BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
@@ -366,7 +366,7 @@ class _Forget:
                 adopt = f"`ros2-memory adopt {shlex.quote(folder)}` first"
             return f"this recorder did not make it; to forget it, {adopt}"
         if bag.state is BagState.INCOMPLETE:
-            closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
+            closes = "; ros2-memory recover closes it" if bag.path.suffix == MCAP else ""
             return f"a crash left it open{closes}"
         if bag.path.is_relative_to(self._bag_dir / MOMENTS_FOLDER):
             return "it belongs to a saved moment; delete the moment's folder to forget it"

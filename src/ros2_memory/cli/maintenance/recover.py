@@ -19,6 +19,7 @@ from ros2_memory.cli.options import AsJson
 from ros2_memory.cli.output import print_json, print_line, spinner
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArgumentsError, RecorderError
+from ros2_memory.core.model import MCAP
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
@@ -26,8 +27,6 @@ from ros2_memory.retention.repair import Repaired, Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S
 """An unknown program may still write a file that changed so lately."""
-
-_MCAP: Final = ".mcap"
 
 
 def recover(
@@ -193,8 +192,8 @@ def _require_unused(
         status = file.lstat()
     except OSError as error:
         raise BagVanishedError(str(file), "it is not there any more") from error
-    if not status.st_size and file.suffix != _MCAP:
-        raise BagError(str(file), f"it is empty, and its name does not end in {_MCAP}")
+    if not status.st_size and file.suffix != MCAP:
+        raise BagError(str(file), f"it is empty, and its name does not end in {MCAP}")
     if (status.st_dev, status.st_ino) in opened:
         raise BagError(str(file), "a process has it open; end that first")
     age = now - status.st_mtime_ns
@@ -225,4 +224,4 @@ def _files_below(path: Path, clock: Clock) -> list[Path]:
         raise RecorderError(f"{path} cannot be listed: {tree.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
     bags = (Path(name) for name in tree.stamps if not is_saved(path, name))
-    return sorted(bag for bag in bags if bag.suffix == _MCAP)
+    return sorted(bag for bag in bags if bag.suffix == MCAP)

@@ -14,6 +14,7 @@ from mcap import records as mcap_records
 from mcap.writer import CompressionType, IndexType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.core.model import SQLITE
 from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Channel, Record, Rewritten, Schema
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
@@ -114,7 +115,7 @@ class McapWriter(BagWriter):
     ) -> Counter[str]:
         """Copies a whole file without some messages."""
         with _new_file(target) as stream:
-            if source.suffix.lower() == ".db3":
+            if source.suffix.lower() == SQLITE:
                 with reading(source):
                     return cut_sqlite(source, target, stream, leaves_out)
             with reading(source), OpenFile(source) as file:
