@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.columns.decode import Group, undecoded
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.storage.base import Channel, Record
+    from ros2_memory.storage.base import Channel
 
+T = TypeVar("T")
 _DEADLINE_CHECK_INTERVAL: Final = 256
 """Messages between two looks at the deadline."""
 _DELETED: Final = Reason(
@@ -80,6 +81,7 @@ class BagAccess:
         call.saw(self.snapshot)
         self.notes = Notes()
         self._deadline = call.deadline
+        self._lost = 0  # how often a part of a bag could not be read
 
     def end_early(self, left_s: float) -> None:
         """Ends reading `left_s` before the call's deadline, but not before half of its time."""
@@ -187,6 +189,7 @@ class BagAccess:
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:
         """Notes that a bag, or a part of it, is not in the answer, if it lies in the window."""
+        self._lost += 1
         self.memory.scanner.met_damage(bag, error)
         lost = error.lost or (bag.start, bag.end)
         kind, reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE, error.reason
@@ -215,40 +218,38 @@ class BagAccess:
         """
         self.check_deadline()
         part, is_thin = _indexed_part(bag, window), is_thinned(bag.file)
-        # The stage "read" is the time of the reader, without that of the caller between messages.
-        clock, spent, count = time.perf_counter_ns, 0, 0
-        begin = clock()
+        records = self.memory.reader.records(bag.path, topics, part, newest_first=newest_first)
+        for count, record in enumerate(self._readable(bag, records, TimeWindow(since, MAX_NS)), 1):
+            if is_thin:
+                self.call.note_thinned(record.log_time, record.log_time)
+            if count % _DEADLINE_CHECK_INTERVAL == 0:
+                self.check_deadline()
+            yield StoredMessage(bag, record)
+
+    def _readable(self, bag: BagFile, items: Iterator[T], window: TimeWindow) -> Iterator[T]:
+        """Yields what can be read of a bag; behind a lost part the reader continues.
+
+        The stage "read" is the time of the reader, without that of the caller between items. There
+        are notes on what is lost in the window.
+        """
+        clock, spent = time.perf_counter_ns, 0
         try:
-            for record in self._records(bag, topics, part, newest_first, since):
-                spent += clock() - begin
-                count += 1
-                if is_thin:
-                    self.call.note_thinned(record.log_time, record.log_time)
-                if count % _DEADLINE_CHECK_INTERVAL == 0:
-                    self.check_deadline()
-                yield StoredMessage(bag, record)
+            while True:
                 begin = clock()
-            spent += clock() - begin
+                try:
+                    item = next(items, None)
+                except BagError as error:
+                    self._note_unreadable(bag, error, window)
+                    if error.lost is None:
+                        return
+                    continue
+                finally:
+                    spent += clock() - begin
+                if item is None:
+                    return
+                yield item
         finally:
             self.call.stages.add("read", spent)
-
-    def _records(
-        self, bag: BagFile, topics: Sequence[str], part: TimeWindow, newest_first: bool, since: Ns
-    ) -> Iterator[Record]:
-        """Yields the records that can be read; after a lost part the reader continues."""
-        records: Iterator[Record] | None = None
-        while True:
-            try:
-                if records is None:
-                    reader = self.memory.reader
-                    records = reader.records(bag.path, topics, part, newest_first=newest_first)
-                yield from records
-            except BagError as error:
-                self._note_unreadable(bag, error, TimeWindow(since, MAX_NS))
-                if error.lost is None:
-                    return
-            else:
-                return
 
     def tables(
         self,
@@ -279,9 +280,7 @@ class BagAccess:
         key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         cached = cache.get(key) if is_lasting else None
-        to_cache: list[list[Table]] | None = [] if is_lasting and cached is None else None
-        size = 0
-        groups: Iterator[list[Table]]
+        groups: Iterator[list[Table]] = iter(cached or ())
         if cached is None:
             read_now = undecoded(
                 self.memory.reader,
@@ -293,28 +292,17 @@ class BagAccess:
                 most_numbers=MOST_DECODED_NUMBERS,
             )
             groups = map(Group.tables, read_now)
-        else:
-            groups = iter(cached)
-        while True:
-            try:
-                with self.call.stages.timed("read"):
-                    tables = next(groups, None)
-            except BagError as error:
-                to_cache = None  # each answer has to note what is lost
-                self._note_unreadable(bag, error, window)
-                if error.lost is None:
-                    return
-                continue
-            if tables is None:
-                break
+        to_cache: list[list[Table]] = []
+        size, lost_before = 0, self._lost
+        for tables in self._readable(bag, groups, window):
             self._track_source(bag)
-            if to_cache is not None:
+            size += 1000 + sum(table.memory_bytes for table in tables)
+            if is_lasting and size <= DECODED_BYTES:
                 to_cache.append(tables)
-                size += 1000 + sum(table.memory_bytes for table in tables)
-                to_cache = to_cache if size <= DECODED_BYTES else None
             yield from tables
             self.check_deadline()
-        if to_cache is not None:
+        # Each answer has to note what is lost.
+        if is_lasting and size <= DECODED_BYTES and self._lost == lost_before:
             cache.put(key, to_cache, size)
 
 
