@@ -129,9 +129,9 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.driven_path import Body
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 

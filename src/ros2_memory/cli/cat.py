@@ -20,11 +20,11 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.robots import note_times_twice
-from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.tools.reply_size import to_json_text
 

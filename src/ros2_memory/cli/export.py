@@ -20,11 +20,11 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.robots import note_times_twice
-from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.storage.base import BagReader, Record
 
 SCHEMA: Final = pa.schema(

@@ -27,9 +27,9 @@ from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Span
+from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.no_data import require_bags
-from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
 

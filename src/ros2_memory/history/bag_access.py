@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from zlib import crc32
 
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.columns.decode import Group, undecoded
@@ -23,13 +24,12 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Call, Memory, Note, Notes
-from ros2_memory.history.stored_message import StoredMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.base import Channel, Record
 
 T = TypeVar("T")
 _DEADLINE_CHECK_INTERVAL: Final = 256
@@ -45,6 +45,33 @@ _AWAY: Final = Reason(
 _CONTRADICTS_ITSELF: Final = Reason("contradicts itself", "bag", many="contradict themselves")
 _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
+
+
+class StoredMessage(NamedTuple):
+    """An undecoded message and the bag that it is in."""
+
+    bag: BagFile
+    record: Record
+
+    @property
+    def time(self) -> Ns:
+        """Log time."""
+        return self.record.log_time
+
+    @property
+    def topic(self) -> str:
+        """Name of the topic."""
+        return self.record.channel.topic
+
+    @property
+    def type(self) -> str:
+        """Name of the message type."""
+        return self.record.channel.type
+
+    @property
+    def identity(self) -> tuple[Ns, int]:
+        """Publish time and CRC-32 of the payload: copies of a message of a topic share these."""
+        return self.record.publish_time, crc32(self.record.payload)
 
 
 class Reading:

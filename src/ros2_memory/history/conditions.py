@@ -22,7 +22,7 @@ from ros2_memory.messages.levels import level_number, level_path, unknown_name_h
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
 
 _FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
 """Fields that are fractions by the definitions of their messages."""

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 

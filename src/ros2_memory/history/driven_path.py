@@ -80,7 +80,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import FrameEdge
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")

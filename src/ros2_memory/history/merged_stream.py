@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.history.bag_access import BagAccess
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import BagAccess, StoredMessage
 
 _MessageKey: TypeAlias = tuple[str, Ns, Ns, int]
 """What tells messages of a topic apart: file, log time, publish time, and hash of the payload."""

@@ -38,8 +38,8 @@ from ros2_memory.index.file_state import HELD_BACK
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Memory
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
 

@@ -32,8 +32,8 @@ from ros2_memory.index.split_order import split_of
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.stored_message import StoredMessage
 
 _NEAR_NS: Final = 10 * NS_PER_S
 """Recordings are of the time of a message if they are this near."""

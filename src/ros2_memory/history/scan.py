@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.stored import PartZones
     from ros2_memory.columns.table import Table
     from ros2_memory.core.arrays import Ints
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import TopicColumn
     from ros2_memory.storage.base import IntArray, Mask

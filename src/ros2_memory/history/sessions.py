@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
 
 Session: TypeAlias = frozenset[str]

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.columns.scan import Scan
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.storage.base import IntArray
 
 

@@ -18,8 +18,8 @@ from ros2_memory.results import Extremes, TypeFields
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.stored_message import StoredMessage
 
 MAX_FIELDS: Final = 100
 MAX_MESSAGES: Final = 4_000

@@ -17,13 +17,19 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.held_values import breaks_of, held_until, is_latched
-from ros2_memory.history.tested_messages import MET, NOT_MET, Block, MatchTester, Tested
+from ros2_memory.history.reverse_search import (
+    MET,
+    NOT_MET,
+    Block,
+    MatchTester,
+    ReverseSearch,
+    Tested,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.core.arrays import Flags, Ints
-    from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 

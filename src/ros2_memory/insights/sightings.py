@@ -61,8 +61,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.arrays import Ints
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.stored_message import StoredMessage
 
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.stored_message import StoredMessage
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 

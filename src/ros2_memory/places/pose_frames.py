@@ -57,8 +57,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, Waypoint
     from ros2_memory.core.arrays import Flags
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.sessions import Session
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.places.stays import KnownTrack
 

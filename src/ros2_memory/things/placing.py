@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import BagFile
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.sessions import Session
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
 
 

@@ -58,8 +58,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.conditions import Sought
-    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.things.instances import Instance, Move, PlacedStay
     from ros2_memory.things.known import KnownThings
 

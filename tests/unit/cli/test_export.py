@@ -20,8 +20,8 @@ from ros2_memory.cli.options import parse_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call
-from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (

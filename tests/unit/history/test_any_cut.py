@@ -29,7 +29,7 @@ from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history import tested_messages
+from ros2_memory.history import reverse_search
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.index import timeline
@@ -393,7 +393,7 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
 
 
 @patch.object(Scanner, "damaged_parts", lambda *_: [])  # Who fills knows of damage earlier.
-@patch.object(tested_messages, "MOST_UNSURE", 1)
+@patch.object(reverse_search, "MOST_UNSURE", 1)
 @settings(max_examples=60 if LONG else 1)
 @given(seed=st.integers(0, 2**32))
 @example(17293)  # A topic of two types, in recordings side by side.
