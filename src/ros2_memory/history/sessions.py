@@ -67,12 +67,12 @@ class _TransformSpans(NamedTuple):
 
     Attributes:
         kinds: by folder, the span of its moving transforms; the same of its static ones.
-        poses: folders with the robot's own poses, and the spans of these.
+        poses: by folder, the span of the robot's own poses.
         joined: by folder, the folders that handovers join with it.
     """
 
     kinds: tuple[Mapping[str, Span], Mapping[str, Span]]
-    poses: Sequence[tuple[str, Span]]
+    poses: Mapping[str, Span]
     joined: Mapping[str, Session]
 
 
@@ -243,7 +243,7 @@ class Sessions:
         """Whether two sessions hold poses at the same time, near a moment."""
         near = [
             (folder, span)
-            for folder, span in self._spans.poses
+            for folder, span in self._spans.poses.items()
             if _distance(span, at) <= TF_CACHE_NS
         ]
         for (folder, (first, last)), (other, (begin, end)) in combinations(near, 2):
@@ -259,9 +259,15 @@ class Sessions:
         """
         if self._kinds(first) & self._kinds(other):
             return False
-        topics = (*self._view.moving_topics, *self._view.static_topics)
-        frames = {child for _, child in self.pairs(topics, first)}
-        return frames.isdisjoint(child for _, child in self.pairs(topics, other))
+        return self._children(first).isdisjoint(self._children(other))
+
+    def _children(self, session: Session) -> set[str]:
+        """Returns the frames that transforms of a session place."""
+        children: set[str] = set()
+        for topic in (*self._view.moving_topics, *self._view.static_topics):
+            for _, pairs in self.pairs_back(topic, session):
+                children.update(child for _, child in pairs)
+        return children
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns the positions in `_TransformSpans.kinds` of what a session holds."""
@@ -312,7 +318,7 @@ class Sessions:
         chains = components(handovers)
         return _TransformSpans(
             (self._spans_of(view.moving_topics), self._spans_of(view.static_topics)),
-            [*self._spans_of((view.pose_topic,)).items()],
+            self._spans_of((view.pose_topic,)),
             {folder: frozenset(linked | {self._carried}) for folder, linked in chains.items()},
         )
 
@@ -471,13 +477,11 @@ class Sessions:
         view = self._view
         reading = view.call.partial_after(READING_S)
         by_folder: dict[str, dict[Pair, bool]] = defaultdict(dict)
-        for topic in view.static_topics:
-            for recording, pairs in self._tables_back(topic, None):
-                by_folder[self.folder(recording)] |= dict.fromkeys(pairs, True)
-        for topic in view.moving_topics:
-            for recording, pairs in self._tables_back(topic, None):
-                by_folder[self.folder(recording)] |= dict.fromkeys(pairs, False)
-                if reading.expired():
+        for topic in (*view.static_topics, *view.moving_topics):
+            is_static = topic not in view.moving_topics
+            for recording, pairs in self.pairs_back(topic):
+                by_folder[self.folder(recording)] |= dict.fromkeys(pairs, is_static)
+                if not is_static and reading.expired():
                     view.notes.add_lack("out of time: frames that only older bags have are missing")
                     break
         unnamed = {pair for pairs in by_folder.values() for pair in pairs if not is_edge(pair)}
@@ -485,24 +489,13 @@ class Sessions:
             view.notes.add(f"pairs left out, since a frame has no name: {len(unnamed)}")
         return by_folder
 
-    def pairs(self, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
-        """Returns the pairs of topics, of a session or of all."""
-        pair_sets = (self.pairs_back(topic, session) for topic in topics)
-        return set[Pair]().union(*chain.from_iterable(pair_sets))
-
     def pairs_back(
-        self, topic: str, session: Session | None, window: TimeWindow | None = None
-    ) -> Iterator[frozenset[Pair]]:
+        self, topic: str, session: Session | None = None, window: TimeWindow | None = None
+    ) -> Iterator[tuple[Path, frozenset[Pair]]]:
         """Yields the pairs of a topic (in a window), of a session or of all, the newest first.
 
-        Each set is of one table.
+        Each set is of one table, and comes with the recording of that.
         """
-        return (pairs for _, pairs in self._tables_back(topic, session, window))
-
-    def _tables_back(
-        self, topic: str, session: Session | None, window: TimeWindow | None = None
-    ) -> Iterator[tuple[Path, frozenset[Pair]]]:
-        """Yields `pairs_back`, each with its recording."""
         window = TimeWindow.everything() if window is None else window
         if session is not None:
             window = window.intersect(self._window_of(session, (topic,)))

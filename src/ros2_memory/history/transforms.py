@@ -309,8 +309,8 @@ def connects(
         *(sessions.pairs_back(topic, session, window) for topic in view.moving_topics),
     ]
     # One table of each topic at a time: mostly the newest of each is enough.
-    for tables in zip_longest(*by_topic, fillvalue=frozenset[Pair]()):
-        more = frozenset[Pair]().union(*tables)
+    for tables in zip_longest(*by_topic):
+        more = frozenset[Pair]().union(*(table for _, table in filter(None, tables)))
         if more <= pairs:
             continue
         pairs |= more
