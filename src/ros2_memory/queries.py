@@ -40,7 +40,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
-from ros2_memory.history.clock_steps import clock_steps, elapsed_in
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.condition_hints import compared_frames, position_frames
 from ros2_memory.history.conditions import Sought, condition_of, note_no_fix, types_matching
 from ros2_memory.history.coverage import (
@@ -820,7 +820,7 @@ def trajectory_summary(
     if frame_id in {None, own_frame}:
         note_runs(view, name, own_frame, window)
     view.notes.add(*axes_of(frame_id or own_frame))
-    elapsed = elapsed_in(view, window)
+    elapsed = view.elapsed_in(window)
     # The least line has two ends: fewer waypoints are cut from it.
     whole = with_runs(view, name, path, path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE)))
     shown = while_recorded(across_steps(whole, path, elapsed), elapsed, path)

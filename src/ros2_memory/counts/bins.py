@@ -30,7 +30,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
@@ -342,7 +341,7 @@ class BinnedWindow:
         self._columns: list[_Column] = []
         self.usual: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
-        self.elapsed = elapsed_in(view, self.window)
+        self.elapsed = view.elapsed_in(self.window)
         self._since: Ns | None = None
 
     def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:

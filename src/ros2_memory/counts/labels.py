@@ -29,7 +29,6 @@ from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import Reason, listed, named
 from ros2_memory.counts.bins import HELD_COLUMNS
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import note_edges, note_unread, seconds, shown_span, unix_text
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
@@ -142,7 +141,7 @@ def count_labels(
             f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
         )
     window = scope.window if seen.since is None else replace(scope.window, start=seen.since)
-    elapsed = elapsed_in(view, window)
+    elapsed = view.elapsed_in(window)
     rows = _label_rows(seen, elapsed)
     note_robots_on(view, topics, window)
     note_unread(view, asked, nothing=not rows, search=True)

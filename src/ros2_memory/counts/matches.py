@@ -34,7 +34,6 @@ from ros2_memory.core.text import Quoted, counted, listed, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
 from ros2_memory.counts.labels import BY_LABEL, count_labels, read_labels
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
@@ -456,7 +455,7 @@ def count_values(
     if not held_values:
         raise no_data_between(view, (topic,), asked)
     outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
-    named_rows = _value_rows(held_values, elapsed_in(view, asked), united(outside), condition)
+    named_rows = _value_rows(held_values, view.elapsed_in(asked), united(outside), condition)
     if len(named_rows) > _MOST_VALUES:
         more = counted(len(named_rows) - _MOST_VALUES, "value")
         view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")

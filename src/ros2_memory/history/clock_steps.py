@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns, Span
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
 
 _MOST_SUSPECTS: Final = 32
@@ -72,13 +72,6 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
 
 def _reaches_into(window: TimeWindow, step: ClockStep) -> bool:
     return window.overlaps(step.at, step.at + max(step.by - 1, 0))
-
-
-def without_steps(view: View, gaps: Sequence[Span]) -> Sequence[Span]:
-    """Returns the gaps that are no step of the clock. `gaps` are sorted and not empty."""
-    around = TimeWindow(gaps[0][0], gaps[-1][1])
-    steps = {step.at for step in _steps_in_time(view, around) or () if step.by > 0}
-    return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:

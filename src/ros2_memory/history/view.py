@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.clock_steps import elapsed_in, skipped_in, without_steps
+from ros2_memory.history.clock_steps import elapsed_in, skipped_in
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
@@ -175,7 +175,10 @@ class View:
         }
         # Most windows have no pause: then the gaps, which follow from all bags, are not needed.
         gaps = [gap for gap in self.snapshot.gaps if gap in pauses] if pauses else []
-        return without_steps(self, gaps) if gaps and not steps else gaps
+        if steps or not gaps:
+            return gaps
+        skipped = {start for start, _ in self.skipped_in(TimeWindow(gaps[0][0], gaps[-1][1]))}
+        return [(start, end) for start, end in gaps if start not in skipped]
 
     def elapsed_in(self, window: TimeWindow) -> Elapsed:
         """Returns how much time passed between moments of a window, with a note on each step."""

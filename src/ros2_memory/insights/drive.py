@@ -40,7 +40,6 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import recording_gaps, shown_span, span_text
 from ros2_memory.history.driven_path import (
     PoseSlice,
@@ -142,7 +141,7 @@ class Drive:
 
 def drive_in(view: View, window: TimeWindow) -> Drive:
     """Returns how the robot moved in a window. If that is unknown, a note says why."""
-    elapsed, (start, end) = elapsed_in(view, window), window.asked()
+    elapsed, (start, end) = view.elapsed_in(window), window.asked()
     unknown = Drive(end - start, elapsed)
     try:
         topic = resolve_path_topic(view)

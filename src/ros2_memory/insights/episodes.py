@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
 from ros2_memory.history.held_values import HeldValue, HeldValues, holds_on, is_latched, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
@@ -262,7 +261,7 @@ def topic_changes(
         )
     if not held:
         raise no_data_between(view, (topic,), window)
-    elapsed = elapsed_in(view, window)
+    elapsed = view.elapsed_in(window)
     spells = [
         replace(spell_of(value), skipped=elapsed.skipped_between(value.start, value.stop))
         for value in held

@@ -22,7 +22,6 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
@@ -110,7 +109,7 @@ def find_matches(
     selection = _Selection(limit, oldest_first, frame_id, fields)
     found = _select_rows(view, topic, condition, scope, selection)
     topics, is_never = matching_topics(view, topic), found.total == 0
-    elapsed = elapsed_in(view, found.searched)
+    elapsed = view.elapsed_in(found.searched)
     rows = [_with_durations(row, elapsed, other) for row in found.rows]
     note_robots_on(view, topics, found.searched)
     note_unread(view, found.searched, nothing=is_never, search=True)

@@ -28,7 +28,6 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, unix_from_ns
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
 from ros2_memory.history.driven_path import driven_path, no_path, resolve_path_topic
 from ros2_memory.history.robots import require_one_robot
@@ -109,7 +108,7 @@ def driven_inside(
         for waypoint in _way_inside(path.line, stays, max_waypoints)
     )
     spans = [stay.span for stay in stays]
-    duration = elapsed_in(view, window).among(spans)
+    duration = view.elapsed_in(window).among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, path.frames[0], frame_id)

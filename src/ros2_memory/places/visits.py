@@ -29,7 +29,6 @@ from ros2_memory.core.regions import Circle, Region, Steps
 from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, Span, ns_from_unix
-from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import require_recorded
@@ -225,7 +224,7 @@ def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed
         unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS, mixed=mixed)
         for track in tracks
     )
-    return elapsed_in(view, window).among(united(chain.from_iterable(spans)))
+    return view.elapsed_in(window).among(united(chain.from_iterable(spans)))
 
 
 def _newest_pose_time(
@@ -307,7 +306,7 @@ class ConfirmedStays:
             QueryTimeoutError: the call's time runs out before any result.
         """
         self.known = known_track(view, frame_id, window)
-        self.elapsed = elapsed_in(view, window)
+        self.elapsed = view.elapsed_in(window)
         self._region, self._window = region, window
         # A shown visit begins at one of the poses by which it was confirmed.
         self._poses = lru_cache(2 * _MOST_TRIED)(TrackReader(view, frame_id).poses)
