@@ -377,9 +377,11 @@ class Latching:
         decided = self._without_pace(snapshot, topic)
         if decided is not None:
             return decided
-        last = {path: last for path, (_, last) in snapshot.timeline.recordings(topic).items()}
+        spans = snapshot.timeline.recordings(topic)
         newest = max(
-            last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
+            spans,
+            key=lambda path: (path.name != CARRY_FOLDER, spans[path][1], str(path)),
+            default=None,
         )
         return newest is not None and snapshot.timeline.pace(topic, newest).is_rare
 

@@ -101,15 +101,6 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
     return Detected(log_times, stamps, joined_detections(detections), frames)
 
 
-class _Message(NamedTuple):
-    """The detections of one decoded message; see `Detected`."""
-
-    log_time: Ns
-    stamp: Ns
-    detections: list[Detection]
-    frame: str
-
-
 class DetectionRows:
     """Reads the detections of rows from their columns, else from their messages.
 
@@ -149,26 +140,23 @@ class DetectionRows:
 
     def _read_messages(self, rows: Rows) -> Detected:
         extractor = self._view.extractor
-        messages: list[_Message] = []
-        for stored in messages_of(self._view, rows):
+        times: list[Ns] = []
+        stamps: list[Ns] = []
+        found: list[Sequence[Detection]] = []
+        frames: list[str] = []
+        # A part has bag after bag, in the order in which they were stored.
+        for stored in sorted(messages_of(self._view, rows), key=attrgetter("time")):
             message = self._view.bags.decode(stored)
             if message is None:
                 continue
             frame, stamp = extractor.frame(message), stamp_of(message)
-            detections = [
-                detection if detection.frame_id else detection._replace(frame_id=frame)
-                for detection in detections_of(extractor.exact(message, stored.type))
-            ]
-            stamp = stored.time if stamp is None else stamp
-            messages.append(_Message(stored.time, stamp, detections, frame))
-        # A part has bag after bag, in the order in which they were stored.
-        messages.sort(key=attrgetter("log_time"))
-        return Detected(
-            np.array([message.log_time for message in messages], np.int64),
-            np.array([message.stamp for message in messages], np.int64),
-            detections_by([message.detections for message in messages]),
-            Texts.of([message.frame for message in messages]),
-        )
+            detections = detections_of(extractor.exact(message, stored.type), frame)
+            times.append(stored.time)
+            stamps.append(stored.time if stamp is None else stamp)
+            found.append(detections)
+            frames.append(frame)
+        columns = np.array(times, np.int64), np.array(stamps, np.int64)
+        return Detected(*columns, detections_by(found), Texts.of(frames))
 
 
 def seen_at(view: View, stored: StoredMessage) -> Ns:

@@ -10,7 +10,7 @@ Such a message counts once too, at its earliest log time, however long ago that 
 from __future__ import annotations
 
 import heapq
-from collections import Counter, deque
+from collections import Counter
 from functools import partial
 from itertools import chain, compress, pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -231,24 +231,19 @@ class MergedStream:
             yield from read(bags[0].bag, window=_part_with_messages(bags[0], window))
             return
         sign = -1 if newest_first else 1
-        # With the least sort key of each bag's messages: its first message, or its last one.
-        waiting = deque(
-            sorted(
-                (-extent.last if newest_first else extent.first, sign * rank, extent)
-                for rank, extent in enumerate(sorted(bags, key=_by_recording))
-            )
-        )
-        heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
-        while heap or waiting:
-            if waiting and (not heap or waiting[0][0] <= heap[0][0]):
-                _, rank, extent = waiting.popleft()
-                source = read(extent.bag, window=_part_with_messages(extent, window))
-            else:
-                _, rank, stored, source = heapq.heappop(heap)
+
+        def received(
+            rank: int, extent: TopicExtent
+        ) -> Iterator[tuple[Ns, int, StoredMessage | None]]:
+            # Until the stream reaches the first of them (or the last), no message is asked for.
+            yield -extent.last if newest_first else extent.first, rank, None
+            for stored in read(extent.bag, window=_part_with_messages(extent, window)):
+                yield sign * stored.time, rank, stored
+
+        in_order = enumerate(sorted(bags, key=_by_recording))
+        for _, _, stored in heapq.merge(*(received(sign * rank, bag) for rank, bag in in_order)):
+            if stored is not None:
                 yield stored
-            following = next(source, None)
-            if following is not None:
-                heapq.heappush(heap, (sign * following.time, rank, following, source))
 
 
 def _part_with_messages(extent: TopicExtent, window: TimeWindow) -> TimeWindow:

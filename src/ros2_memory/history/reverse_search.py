@@ -190,8 +190,8 @@ class CandidateRows:
             newest = max([last, *pending[-1:].tolist()])
             self._scanned_to[topic] = min(newest + 1, self._window.stop)
 
-        def pending_after(last: Ns) -> Iterator[tuple[Ns, str]]:
-            for time in map(int, pending[np.searchsorted(pending, last, "right") :][::-1]):
+        def candidates(times: IntArray) -> Iterator[tuple[Ns, str]]:
+            for time in times[::-1].tolist():
                 self._scanned_to[topic] = time + 1
                 yield time, topic
 
@@ -204,11 +204,10 @@ class CandidateRows:
             may_be_empty=True,
             before_table=note_progress,
         ):
-            yield from pending_after(rows.last)
-            pending = pending[: np.searchsorted(pending, rows.last, "right")]
-            pending = np.union1d(pending, self._candidate_times(rows))
-            note_progress(rows.last)
-        yield from pending_after(MIN_NS)
+            older = np.searchsorted(pending, rows.last, "right")
+            yield from candidates(pending[older:])
+            pending = np.union1d(pending[:older], self._candidate_times(rows))
+        yield from candidates(pending)
         self._scanned_to[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:

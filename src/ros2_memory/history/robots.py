@@ -56,10 +56,6 @@ MOST_REMEMBERED: Final = 1_000
 """So many comparisons of two recordings are remembered: each window of a question is one."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
-_OWN: Final[Key[frozenset[Path]]] = Key()
-"""Of a view: the recordings that the recorder of the bag directory made."""
-_MISDATED: Final[Key[frozenset[Path]]] = Key()
-"""Of a view: the recordings with a wrong date."""
 
 
 class _StaticTree(NamedTuple):
@@ -398,9 +394,14 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     # A thinned day contains the bags of moments and rules of that day.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
     spans = [_TopicSpan(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
+    if len(spans) < 2:
+        return
+    loose = loose_bags_beside_others(view.snapshot)
     loose_files: dict[str, list[str]] = defaultdict(list)
-    for file, recording in loose_bags_beside_others(view.snapshot).items():
+    for file, recording in loose.items():
         loose_files[recording].append(file)
+    own = _own_recordings(view.bag_dir)
+    misdated = {_recording_of(fault.bag, loose) for fault in view.snapshot.dating.faults}
     going_on: list[_TopicSpan] = []
     for later in sorted(spans):
         going_on = [earlier for earlier in going_on if earlier.last >= later.first]
@@ -410,7 +411,8 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             is_asked = is_there and window.overlaps(span.start, span.stop - 1)
             pair = earlier.path, later.path
             if is_asked and not view.sessions.are_joined(*pair):
-                by_clock = _is_short_edge(earlier, later) or _are_of_wrong_clock(view, *pair)
+                is_wrong = own.issuperset(pair) or not misdated.isdisjoint(pair)
+                by_clock = is_wrong or _is_short_edge(earlier, later)
                 bags = frozenset(loose_files.get(str(later.path), ()))
                 yield ParallelRecordings(*pair, span, by_clock, bags)
         going_on.append(later)
@@ -474,22 +476,6 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
             yield ParallelRecordings(
                 recording, recording, span, by_clock=True, bags=frozenset(bags)
             )
-
-
-def _are_of_wrong_clock(view: View, first: Path, other: Path) -> bool:
-    """Whether a wrong clock dated a bag of two recordings, or was set back between or in them.
-
-    It was set back between them if one recorder made both, one after the other.
-    """
-    own = view.memo.of(_OWN, lambda: _own_recordings(view.bag_dir))
-    misdated = view.memo.of(_MISDATED, lambda: _misdated(view))
-    return own.issuperset((first, other)) or not misdated.isdisjoint((first, other))
-
-
-def _misdated(view: View) -> frozenset[Path]:
-    """Returns the recordings with a bag that a wrong clock dated, or in which it was set back."""
-    loose = loose_bags_beside_others(view.snapshot)
-    return frozenset(_recording_of(fault.bag, loose) for fault in view.snapshot.dating.faults)
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
