@@ -62,6 +62,37 @@ _LARGEST_GROUP: Final = 256
 _NO_TIMES: Final = np.empty(0, np.int64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
+    """Messages of a topic, ordered by log time, and which of them meet a condition.
+
+    Attributes:
+        times: log times (ns).
+        met: `MET`, `NOT_MET` or `UNKNOWN` for each message.
+        sources: the number of each message's recording and type, which orders equal log times.
+    """
+
+    times: IntArray
+    met: NDArray[np.uint8]
+    sources: IntArray
+
+
+class Block(NamedTuple):
+    """Messages of a topic between two log times (inclusive).
+
+    Attributes:
+        first, last: no message is earlier or later.
+        has_match: whether some message may meet the condition.
+        tested: tests the messages, once.
+    """
+
+    topic: str
+    first: Ns
+    last: Ns
+    has_match: bool
+    tested: Callable[[], Tested]
+
+
 class RowCondition:
     """Finds which rows of scans meet a condition, by their columns.
 
@@ -254,6 +285,7 @@ class ReverseSearch:
     Attributes:
         topics: the recorded topics that match the name or glob.
         condition: the condition.
+        ruled_out: whether columns showed for any message that it does not match.
 
     Raises:
         InvalidArgumentsError: the condition names a frame in which a topic has no positions.
@@ -265,6 +297,9 @@ class ReverseSearch:
         self.condition = condition
         self.topics = matching_topics(view, pattern)
         require_frame(view, self.topics, condition)
+        self.ruled_out = False
+        self._test = RowCondition(view, condition)
+        self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
 
@@ -293,19 +328,18 @@ class ReverseSearch:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.searched_to) from error
-        self.close(window, is_found=False, ruled_out=candidates.ruled_out)
+        self.ruled_out |= candidates.ruled_out
+        self.close(window, is_found=False)
         return None
 
-    def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
+    def close(self, window: TimeWindow, *, is_found: bool) -> None:
         """Ends a search that looked everywhere in a window; notes what could not be tested.
-
-        `ruled_out`: whether columns showed that some message is no match.
 
         Raises:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
             NoDataError: nothing was found, since no message could be decoded.
         """
-        if not is_found and self._failures and not self._has_decoded and not ruled_out:
+        if not is_found and self._failures and not self._has_decoded and not self.ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self._note_undecodable(MIN_NS)
@@ -401,85 +435,7 @@ class ReverseSearch:
             return False
         return extractor.exact_at(message, stored.type, field) not in (None, [])
 
-    def matches(self, stored: StoredMessage) -> bool | None:
-        """Whether a message meets the condition; None if it lacks the field, or is not decoded."""
-        failures: list[UndecodableError] = []
-        with self._view.call.stages.timed("extract"):
-            message = self._view.bags.decode(stored, failures)
-            if not failures:  # a message may be null, as JSON
-                self._has_decoded = True
-                value = self._view.extractor.exact(message, stored.type)
-                own = self.condition.of_type(stored.type, self._view.extractor)
-                return None if own.is_unstated(value) else own.matches(value)
-        key = stored.topic, stored.type
-        # The newest failure is reported; messages may be tested in any order.
-        if key not in self._failures or self._failures[key][1] < stored.time:
-            self._failures[key] = failures[0], stored.time
-        return None
-
-    def note_untested(self, window: TimeWindow) -> None:
-        """Notes on which topics messages of a window could not be tested, or only in part."""
-        self._note_undecodable(window.start)
-        if self.condition.looks_at_numbers:
-            for topic in self.topics:
-                note_summarised(self._view, topic, [self.condition.array], window)
-
-    def _note_undecodable(self, since: Ns) -> None:
-        for (topic, type_name), (error, newest) in self._failures.items():
-            if newest >= since:
-                kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
-                self._view.notes.add_lack(Note(kind, f"{topic} ({type_name})"))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tested:
-    """Messages of a topic, ordered by log time, and which of them meet a condition.
-
-    Attributes:
-        times: log times (ns).
-        met: `MET`, `NOT_MET` or `UNKNOWN` for each message.
-        sources: the number of each message's recording and type, which orders equal log times.
-    """
-
-    times: IntArray
-    met: NDArray[np.uint8]
-    sources: IntArray
-
-
-class Block(NamedTuple):
-    """Messages of a topic between two log times (inclusive).
-
-    Attributes:
-        first, last: no message is earlier or later.
-        has_match: whether some message may meet the condition.
-        tested: tests the messages, once.
-    """
-
-    topic: str
-    first: Ns
-    last: Ns
-    has_match: bool
-    tested: Callable[[], Tested]
-
-
-class MatchTester:
-    """Tests the messages of topics by columns, and else by `matches`.
-
-    Attributes:
-        ruled_out: whether columns showed for any message that it does not match.
-    """
-
-    def __init__(
-        self, view: View, condition: Condition, matches: Callable[[StoredMessage], bool | None]
-    ) -> None:
-        self.ruled_out = False
-        self._view = view
-        self._condition = condition
-        self._matches = matches
-        self._test = RowCondition(view, condition)
-        self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
-
-    def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
+    def blocks(self, topic: str, window: TimeWindow) -> Iterator[Block]:
         """Yields the messages of a topic in blocks that do not overlap, the newest block first."""
         waiting: Block | None = None
         try:
@@ -529,10 +485,10 @@ class MatchTester:
         edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
         for neighbours in np.split(undecided, edges) if undecided.size else ():
             for nth, message in messages_at(self._view, rows.some(neighbours)):
-                is_match = self._matches(message)
+                is_match = self.matches(message)
                 met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
         tested = Tested(rows.times, met, np.full(len(rows), source))
-        if topic in self._view.moving_topics and plain_text(self._condition.test):
+        if topic in self._view.moving_topics and plain_text(self.condition.test):
             # A message of transforms that does not name a frame says nothing of it.
             return rows_of(tested, met == MET)
         return tested
@@ -545,6 +501,35 @@ class MatchTester:
             sources = product(recordings, sorted(timeline.types_of(topic)))
             self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}
         return self._numbers[topic]
+
+    def matches(self, stored: StoredMessage) -> bool | None:
+        """Whether a message meets the condition; None if it lacks the field, or is not decoded."""
+        failures: list[UndecodableError] = []
+        with self._view.call.stages.timed("extract"):
+            message = self._view.bags.decode(stored, failures)
+            if not failures:  # a message may be null, as JSON
+                self._has_decoded = True
+                value = self._view.extractor.exact(message, stored.type)
+                own = self.condition.of_type(stored.type, self._view.extractor)
+                return None if own.is_unstated(value) else own.matches(value)
+        key = stored.topic, stored.type
+        # The newest failure is reported; messages may be tested in any order.
+        if key not in self._failures or self._failures[key][1] < stored.time:
+            self._failures[key] = failures[0], stored.time
+        return None
+
+    def note_untested(self, window: TimeWindow) -> None:
+        """Notes on which topics messages of a window could not be tested, or only in part."""
+        self._note_undecodable(window.start)
+        if self.condition.looks_at_numbers:
+            for topic in self.topics:
+                note_summarised(self._view, topic, [self.condition.array], window)
+
+    def _note_undecodable(self, since: Ns) -> None:
+        for (topic, type_name), (error, newest) in self._failures.items():
+            if newest >= since:
+                kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
+                self._view.notes.add_lack(Note(kind, f"{topic} ({type_name})"))
 
 
 def _merged_and_split(waiting: Block, following: Block) -> tuple[Block | None, Block]:

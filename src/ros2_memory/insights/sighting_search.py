@@ -17,14 +17,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.held_values import breaks_of, held_until, is_latched
-from ros2_memory.history.reverse_search import (
-    MET,
-    NOT_MET,
-    Block,
-    MatchTester,
-    ReverseSearch,
-    Tested,
-)
+from ros2_memory.history.reverse_search import MET, NOT_MET, Block, ReverseSearch, Tested
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -205,9 +198,8 @@ def find_runs(
         NoDataError: none of the topics' messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
-    tester = MatchTester(view, search.condition, search.matches)
     # Messages outside of a scope are not read, and may well be decodable.
-    tester.ruled_out = scope.is_bounded
+    search.ruled_out = scope.is_bounded
     topics, is_log = search.topics, view.timeline.is_log
     breaks = {topic: breaks_of(view, topic) for topic in topics if is_latched(view, topic)}
     latched = [topic for topic in breaks if scope.is_bounded]
@@ -220,7 +212,7 @@ def find_runs(
     windows = [scope.window] if latched else scope.narrowed()
     reached = scope.window.stop
     try:
-        for block in _blocks_newest_first(view, tester, scope, windows, by_topic):
+        for block in _blocks_newest_first(view, search, scope, windows, by_topic):
             is_whole = not scope.is_bounded or block.topic in latched
             by_topic[block.topic].add(block if is_whole else _in_scope(block, scope))
             reached = block.first if len(topics) == 1 else block.last
@@ -237,13 +229,13 @@ def find_runs(
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_untested(replace(scope.window, start=int(found.spans[enough - 1, 0])))
         return replace(found, searched_to=reached)
-    search.close(scope.window, is_found=len(found.table) > 0, ruled_out=tester.ruled_out)
+    search.close(scope.window, is_found=len(found.table) > 0)
     return found
 
 
 def _blocks_newest_first(
     view: View,
-    tester: MatchTester,
+    search: ReverseSearch,
     scope: Scope,
     windows: Iterable[TimeWindow],
     by_topic: Mapping[str, _TopicRuns],
@@ -254,7 +246,7 @@ def _blocks_newest_first(
         for topic, topic_runs in by_topic.items():
             topic_runs.end_in(view, topic, TimeWindow(window.stop, searched))
         searched = window.start
-        blocks = (tester.newest_first(topic, window) for topic in by_topic)
+        blocks = (search.blocks(topic, window) for topic in by_topic)
         yield from heapq.merge(*blocks, key=lambda block: -block.last)
 
 

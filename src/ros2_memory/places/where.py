@@ -32,7 +32,7 @@ from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
-from ros2_memory.history.reverse_search import MET, UNKNOWN, MatchTester, ReverseSearch, Tested
+from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.places.pose_frames import (
@@ -412,7 +412,6 @@ class _ConditionStates:
         if types_matching(view, topic) == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
-        self._tester = MatchTester(view, self.search.condition, self.search.matches)
         self._holds_on = holds_on(view, self.search.topics)
         break_times = ends_of_holding if self._holds_on else deletions
         # After these log times it is not known what the topics say, until their next message.
@@ -513,7 +512,7 @@ class _ConditionStates:
         # Of messages with one log time those of the last topic are the newest.
         parts: list[Tested] = []
         for nth, topic in enumerate(self.search.topics):
-            for block in self._tester.newest_first(topic, window):
+            for block in self.search.blocks(topic, window):
                 tested = block.tested()
                 parts.append(replace(tested, sources=tested.sources + (nth << 32)))
         if not parts:
