@@ -171,7 +171,7 @@ class HeldValues:
 
     def _advice_on_element(self, stored: StoredMessage) -> str:
         """Returns which single value to ask for if the field leads through a list; else nothing."""
-        value = self._view.with_examples(self._view.value(stored), stored)
+        value = self._view.example(stored)
         path = [] if self._field is None else self._field.split(".")
         for nth in range(1, len(path) + 1):
             of_first = ".".join((*path[:nth], "0", *path[nth:]))

@@ -399,7 +399,7 @@ class ReverseSearch:
         for stored in islice(messages, _MOST_EMPTY):
             if stored.type != type_name:
                 continue
-            read = self._view.with_examples(self._view.value(stored), stored)
+            read = self._view.example(stored)
             if newest is None:
                 newest, value = stored, read
                 if value is None:

@@ -134,11 +134,12 @@ class View:
         message = self.bags.decode(stored)
         return None if message is None else self.extractor.exact(message, stored.type)
 
-    def with_examples(self, value: JsonValue, stored: StoredMessage) -> JsonValue:
+    def example(self, stored: StoredMessage) -> JsonValue:
         """Returns a message's whole value with an example in each empty list of messages.
 
-        So it has all fields that its type can have.
+        So it has all fields that its type can have. None if it cannot be decoded.
         """
+        value = self.value(stored)
         definition = self.bags.memory.reader.definition(stored.record.channel)
         paths = self.extractor.plan(stored.type).fields
         return value if definition is None else with_elements(value, definition, paths)

@@ -281,7 +281,7 @@ def _fields_of_constants(
             stored = view.stream.last(topic)
         if stored is None:
             continue
-        value = view.with_examples(view.value(stored), stored)
+        value = view.example(stored)
         for constant in constants:
             yield from fields_of_constant(constant.partition(" ")[0], value)
 
