@@ -12,17 +12,16 @@ from ros2_memory.analysis.facts import BATTERY, FULL_CHARGE
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.history.condition_hints import constant_number
-from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.history.view import View
 from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.history.bag_access import StoredMessage
+    from ros2_memory.history.view import View
 
 _FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
 """Fields that are fractions by the definitions of their messages."""
@@ -98,7 +97,7 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     test, field = condition.test, condition.field
     if field not in _FRACTIONS or not isinstance(test, Beyond):
         return
-    brief = View(view.memory, view.call.within(READING_S), view.reach)
+    brief = view.brief()
     with suppress(QueryTimeoutError):
         if newest_above(brief, pattern, field, FULL_CHARGE) is not None:
             batteries = [

@@ -129,6 +129,10 @@ class View:
                 return True
         return bool(topics_of_robot(self, "position") or unmapped_topics_with(self))
 
+    def brief(self) -> View:
+        """Returns another view, with notes of its own, that has `READING_S` seconds."""
+        return View(self.memory, self.call.within(READING_S), self.reach)
+
     def value(self, stored: StoredMessage) -> JsonValue:
         """Returns a message as JSON; None if it cannot be decoded."""
         message = self.bags.decode(stored)

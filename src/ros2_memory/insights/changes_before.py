@@ -37,7 +37,6 @@ from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.conditions import newest_above
-from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import held_at, is_latched
@@ -460,7 +459,7 @@ def _is_nearly_empty(view: View, topic: str, at: Ns) -> bool:
 
     0.9 % looks like a fraction, but percents that can be no fraction led to it in the hour before.
     """
-    brief = View(view.memory, view.call.within(READING_S), view.reach)
+    brief = view.brief()
     recent = TimeWindow.before(at, _OLDEST_STATE_NS)
     try:
         percent = newest_above(brief, topic, "percentage", FULL_CHARGE, recent)

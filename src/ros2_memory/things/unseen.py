@@ -40,14 +40,13 @@ from ros2_memory.core.text import (
 )
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.condition_hints import constants_named, position_frames, schemas_of
-from ros2_memory.history.context import READING_S, Note
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.detections import LONGEST_LATENCY_NS, stamp_of
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.scan import scan
-from ros2_memory.history.view import View
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import last_word, plain, singular
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.conditions import Sought
+    from ros2_memory.history.view import View
     from ros2_memory.things.instances import Instance, Move, PlacedStay
     from ros2_memory.things.known import KnownThings
 
@@ -296,7 +296,7 @@ def _found_otherwise_spelt(
     test = condition.test
     if not isinstance(test, Contains | Equals) or test.folded is None:
         return ()
-    brief = View(view.memory, view.call.within(READING_S), view.reach)
+    brief = view.brief()
     for word in _other_spellings(test.folded):
         other = replace(test, needle=word) if isinstance(test, Contains) else Equals(word)
         with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
