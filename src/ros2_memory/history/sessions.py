@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import defaultdict
 from functools import cached_property
 from itertools import chain, combinations
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import proxy
 
@@ -46,7 +47,6 @@ from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
@@ -165,10 +165,7 @@ class Sessions:
 
     def are_joined(self, first: Path, other: Path) -> bool:
         """Whether two recordings are of one session."""
-        if self.session_of(first) == self.session_of(other):
-            return True
-        joined_with = self._view.memory.index.joined_with
-        return other.name in joined_with(first) or first.name in joined_with(other)
+        return self.session_of(first) == self.session_of(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
         """Returns the session whose transforms hold for messages of a recording at a moment.
@@ -306,15 +303,12 @@ class Sessions:
 
     def _find_spans(self) -> _TransformSpans:
         view = self._view
-        topics = (*view.moving_topics, *view.static_topics, view.pose_topic)
-        recordings = map(view.timeline.recordings, topics)
-        paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
         handovers: list[tuple[str, str]] = []
-        for folder, path in paths.items():
-            if len(paths) > 1 and str(path) in view.timeline.handed_over:
-                parent, _, _ = folder.rpartition("/")
-                names = view.memory.index.joined_with(path)
-                handovers += [(folder, f"{parent}/{name}") for name in names]
+        for path in map(Path, view.timeline.handed_over):
+            folder = self.folder(path)
+            parent, _, _ = folder.rpartition("/")
+            names = view.memory.index.joined_with(path)
+            handovers += [(folder, f"{parent}/{name}") for name in names]
         chains = components(handovers)
         return _TransformSpans(
             (self._spans_of(view.moving_topics), self._spans_of(view.static_topics)),
