@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
-from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_thinned
@@ -258,14 +257,10 @@ def topics_with(view: View, what: str) -> list[str]:
 
 def _types_with(view: View, what: str) -> dict[str, list[str]]:
     """Returns by topic its types that carry `what`."""
-    kinds_of, types = view.extractor.kinds_of, view.timeline.types
-    # Each type is looked up once: thousands of topics may share it.
-    all_types = set(chain.from_iterable(types.values()))
-    carriers = {type_name for type_name in all_types if what in kinds_of(type_name)}
     carried: dict[str, list[str]] = {}
-    for topic, names in types.items():
+    for topic, names in view.timeline.types.items():
         for name in names:
-            if name in carriers:
+            if what in view.extractor.kinds_of(name):
                 carried.setdefault(topic, []).append(name)
     return carried
 
