@@ -25,9 +25,8 @@ from ros2_memory.history.view import (
     TimeRange,
     View,
     clamped,
+    open_search,
     open_span,
-    open_view,
-    search_window,
 )
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import (
@@ -145,9 +144,7 @@ def count_visits(
         raise InvalidArgumentsError(
             "by place counts the places of where, or all named ones: give where in place of x and y"
         )
-    wall = memory.clock.now()
-    window = search_window(span, wall)
-    view = open_view(memory, call, min(window.stop, wall))
+    view, _, window = open_search(memory, call, span)
     asked = clamped(view, window)
     topic = resolve_path_topic(view)
     mixed_spans = note_robots(view, topic, asked)

@@ -307,7 +307,9 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
         ago = ns_argument("seconds_ago", moment.ago_s or 0.0)
         if ago < 0:
             raise InvalidArgumentsError("seconds_ago must be 0 or more: it counts back from now")
-        view, now = _open_now(memory, call, ago)
+        reach = None if memory.limits.now == "latest" else memory.clock.now() - ago
+        view = open_view(memory, call, reach)
+        now = memory.now(view.snapshot.latest, call)
         at = MIN_NS if ago == MAX_NS else now - ago
     if at > MIN_NS:
         call.asked = (TimeWindow.around(at, THINNED_NS),)
@@ -327,15 +329,13 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
             kinds of bounds are given.
         NoDataError: nothing is recorded.
     """
-    length = _length_asked(span)
-    if length is not None:
-        view, now = _open_now(memory, call, 0)
-        window = _last_window(now, length)
-    else:
-        if span.start_s is None or span.end_s is None:
-            raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
-        window = TimeWindow.from_unix(span.start_s, span.end_s)
-        view = open_view(memory, call, window.stop)
+    if span.last_s is None and (span.start_s is None or span.end_s is None):
+        raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
+    window = search_window(span, memory.clock.now())
+    counts_back = span.last_s is not None and memory.limits.now == "latest"
+    view = open_view(memory, call, None if counts_back else window.stop)
+    if counts_back:
+        window = search_window(span, memory.now(view.snapshot.latest, call))
     window = clamped(view, window)
     call.asked = (window,)
     return view, window
@@ -347,26 +347,13 @@ def search_window(span: TimeRange, now: Ns) -> TimeWindow:
     Raises:
         InvalidArgumentsError: as for `open_span`.
     """
-    length = _length_asked(span)
-    if length is not None:
-        return _last_window(now, length)
-    return TimeWindow.from_unix(span.start_s, span.end_s)
-
-
-def _length_asked(span: TimeRange) -> Ns | None:
-    """Returns how far back from now a range reaches; None if it has bounds."""
     if span.last_s is None:
-        return None
+        return TimeWindow.from_unix(span.start_s, span.end_s)
     if span.start_s is not None or span.end_s is not None:
         raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
     length = ns_argument("seconds", span.last_s)
     if length <= 0:
         raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
-    return length
-
-
-def _last_window(now: Ns, length: Ns) -> TimeWindow:
-    """Returns the window of a length (ns) up to now, with the slack of floats of seconds."""
     start = now - length - START_SLACK_NS
     return TimeWindow(max(start, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
 
@@ -412,10 +399,3 @@ def open_search(memory: Memory, call: Call, span: TimeRange) -> tuple[View, Ns, 
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     now = memory.now(view.snapshot.latest, call)
     return view, now, search_window(span, now)
-
-
-def _open_now(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
-    """Returns the view for a moment before now, and now."""
-    wall = memory.clock.now()
-    view = open_view(memory, call, None if memory.limits.now == "latest" else wall - ago)
-    return view, memory.now(view.snapshot.latest, call)
