@@ -58,15 +58,8 @@ _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = 
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
 
 
-class _StaticTree(NamedTuple):
-    """The parent of each static frame in a recording, and a hash of the files that say so."""
-
-    files: int
-    parents: Mapping[str, str]
-
-
-_TREES: Final[Key[dict[str, _StaticTree]]] = Key()
-"""Of a memory: what closed recordings say of static frames, by path."""
+_TREES: Final[Key[dict[tuple[str, int], Mapping[str, str]]]] = Key()
+"""Of a memory: the parent of each static frame, by a closed recording and a hash of its files."""
 _LONG_NS: Final = 30 * NS_PER_S
 """A shorter overlap at the ends of two recordings is named in the answers that it touches alone."""
 ADVICE: Final = "; data.recording selects one recording"
@@ -142,21 +135,17 @@ def _shared_topics(view: View) -> Iterator[str]:
 def _contradicting_frames(view: View) -> Iterator[str]:
     """Yields a sentence on each static frame that has different parents in two recordings."""
     remembered = view.memory.memo.of(_TREES, dict)
+    known = dict(remembered)
+    remembered.clear()
     trees: dict[str, Mapping[str, str]] = {}
-    recordings = _recordings_to_compare(view)
-    for path in {*remembered} - dict(recordings).keys():
-        remembered.pop(path, None)
-    for path, bags in recordings:
-        files = hash(tuple(bag.identity for bag in bags))
-        tree = remembered.get(path)
+    for path, bags in _recordings_to_compare(view):
+        key = path, hash(tuple(bag.identity for bag in bags))
         try:
-            if tree is None or tree.files != files:
-                tree = _StaticTree(files, _static_parents(view, bags))
+            trees[path] = known[key] if key in known else _static_parents(view, bags)
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
-            remembered[path] = tree
-        trees[path] = tree.parents
+            remembered[key] = trees[path]
     contradicting: set[str] = set()
     for (first, parents), (other, others) in combinations(trees.items(), 2):
         for frame in sorted(parents.keys() & others.keys() - contradicting):

@@ -157,8 +157,6 @@ class View:
 
     def track_thinned(self, window: TimeWindow) -> None:
         """Records for the reply if a window that was read lies partly in thinned days."""
-        if not self.timeline.thinned:
-            return
         for part in map(window.intersect, self.call.asked or (window,)):
             if not part.empty:
                 thinned = overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1)
