@@ -432,7 +432,7 @@ def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
     """Notes how far the robot got until the next pose: a thinned day has one pose a second."""
     window = TimeWindow(stored.time + 1, stored.time + 2 * NS_PER_S)
     newer = view.stream.first([stored.topic], window)
-    message = None if newer is None else view.bags.decode(newer)
+    message = view.bags.decode(newer)
     if newer is None or message is None:
         return
     after = view.extractor.pose(message, newer.type)
@@ -466,7 +466,7 @@ def _position_of_body(asked: _Asked, frame_id: str | None) -> results.Position:
     if len(fix_topics) == 1:
         near = TimeWindow.around(stored.time, ns_from_unix(view.limits.time_tolerance_s))
         fix = view.stream.newest(fix_topics[0], near)
-        message = None if fix is None else view.bags.decode(fix)
+        message = view.bags.decode(fix)
         if fix is not None and message is not None:
             geodetic = view.extractor.geodetic(message, fix.type)
     topic, notes = stored.topic, view.notes.sentences()

@@ -344,10 +344,7 @@ class PieceNumbers:
         """Returns the log times of decodable messages, and the numbers of each field in them."""
         times: list[Ns] = []
         samples: list[list[list[float]]] = [[] for _ in self._fields]
-        for stored in messages:
-            message = self._view.bags.decode(stored, self.failures)
-            if message is None:
-                continue
+        for stored, message in self._view.bags.decoded(messages, self.failures):
             times.append(stored.time)
             for field, field_samples in zip(self._fields, samples, strict=True):
                 value = self._view.extractor.exact_at(message, stored.type, field)

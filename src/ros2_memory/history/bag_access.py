@@ -26,7 +26,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Call, Memory, Note, Notes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import Channel, Record
@@ -197,16 +197,25 @@ class BagAccess:
             self._note_unreadable(bag, error, TimeWindow.everything())
             return ()
 
+    def decoded(
+        self, messages: Iterable[StoredMessage], failures: list[UndecodableError] | None = None
+    ) -> Iterator[tuple[StoredMessage, object]]:
+        """Yields messages with what they decode to, without those that `decode` does not."""
+        for stored in messages:
+            message = self.decode(stored, failures)
+            if message is not None:
+                yield stored, message
+
     def decode(
-        self, stored: StoredMessage, failures: list[UndecodableError] | None = None
+        self, stored: StoredMessage | None, failures: list[UndecodableError] | None = None
     ) -> object:
         """Returns the decoded message; None if its type or its bytes are not understood.
 
-        If `failures` is given, the reason is added to it. The caller has to report it, and the
-        answer is not remembered.
+        None, too, if there is no message. If `failures` is given, the reason is added to it. The
+        caller has to report it, and the answer is not remembered.
         """
         try:
-            return self.memory.reader.decode(stored.record)
+            return None if stored is None else self.memory.reader.decode(stored.record)
         except UndecodableError as error:
             if failures is not None:
                 self.notes.added += 1

@@ -134,7 +134,7 @@ def _frames_of_newest(view: View, topic: str) -> list[str]:
         stored = view.stream.last(topic)
     except QueryTimeoutError:
         return []
-    message = None if stored is None else view.bags.decode(stored)
+    message = view.bags.decode(stored)
     if stored is None or message is None:
         return []
     extractor, type_name = view.extractor, stored.type

@@ -145,10 +145,8 @@ class DetectionRows:
         found: list[Sequence[Detection]] = []
         frames: list[str] = []
         # A part has bag after bag, in the order in which they were stored.
-        for stored in sorted(messages_of(self._view, rows), key=attrgetter("time")):
-            message = self._view.bags.decode(stored)
-            if message is None:
-                continue
+        messages = sorted(messages_of(self._view, rows), key=attrgetter("time"))
+        for stored, message in self._view.bags.decoded(messages):
             frame, stamp = extractor.frame(message), stamp_of(message)
             detections = detections_of(extractor.exact(message, stored.type), frame)
             times.append(stored.time)

@@ -309,10 +309,7 @@ def frame_of_newest_pose(view: View, topic: str) -> str:
 def _frame_of_newest(view: View, topic: str) -> str:
     failures: list[UndecodableError] = []
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for stored in islice(newest, _MOST_TRIED):
-        message = view.bags.decode(stored, failures)
-        if message is None:
-            continue
+    for stored, message in view.bags.decoded(islice(newest, _MOST_TRIED), failures):
         pose = view.extractor.pose(message, stored.type)
         if pose is None:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))

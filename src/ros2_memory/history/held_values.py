@@ -477,10 +477,7 @@ def names_without(view: View, topic: str, field: str, until: Ns) -> list[str]:
     names: dict[str, None] = {}
     window = TimeWindow(MIN_NS, until)
     messages = view.stream.messages([topic], window, newest_first=True)
-    for stored in islice(messages, _MOST_TRIED):
-        message = view.bags.decode(stored)
-        if message is None:
-            continue
+    for stored, message in view.bags.decoded(islice(messages, _MOST_TRIED)):
         value = view.extractor.exact(message, stored.type)
         path = view.extractor.own_path(field, stored.type)
         if not names_others(value, path):

@@ -519,7 +519,7 @@ def require_fields(view: View, topic: str, fields: Sequence[str], until: Ns) -> 
         InvalidArgumentsError: the message lacks a field.
     """
     newest = view.stream.last(topic, until) if fields else None
-    message = None if newest is None else view.bags.decode(newest)
+    message = view.bags.decode(newest)
     if newest is not None and message is not None:
         view.extractor.shown(message, newest.type, fields)
 

@@ -193,10 +193,9 @@ class PoseReader:
         times: list[Ns] = []
         poses: list[Pose] = []
         speeds: list[float] = []
-        for stored in messages_of(self._view, rows):
-            message = self._view.bags.decode(stored, self.failures)
-            if message is None:
-                continue
+        for stored, message in self._view.bags.decoded(
+            messages_of(self._view, rows), self.failures
+        ):
             pose = extractor.pose(message, stored.type)
             twist = extractor.twist(message, stored.type)
             if pose is None:

@@ -186,11 +186,9 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
         holding = (bag for bag in bags if topic in bag.summary.schema.positions)
         spans = [TopicExtent(bag, *bag.summary.span_of((topic,))) for bag in holding]
         merged = view.stream.merged(spans, [topic], window) if spans else ()
-        for stored in islice(merged, _MAX_STATIC):
-            message = view.bags.decode(stored)
-            if message is not None:
-                edges = view.extractor.transforms(message, stored.time, static=True)
-                parents.update({edge.child: edge.parent for edge in edges})
+        for stored, message in view.bags.decoded(islice(merged, _MAX_STATIC)):
+            edges = view.extractor.transforms(message, stored.time, static=True)
+            parents.update({edge.child: edge.parent for edge in edges})
     return parents
 
 

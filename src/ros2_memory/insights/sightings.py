@@ -620,10 +620,7 @@ def _place_of_thing(
         return place
     window = TimeWindow(first, newest.time)
     before = view.stream.messages([newest.topic], window, newest_first=True)
-    for stored in islice(before, _MOST_TRIED):
-        message = view.bags.decode(stored)
-        if message is None:
-            continue
+    for stored, message in view.bags.decoded(islice(before, _MOST_TRIED)):
         value, detections = _counted_content(view, condition, stored.type, message)
         if condition.of_type(stored.type, view.extractor).matches(value):
             thing = _sought_detection(detections, condition)

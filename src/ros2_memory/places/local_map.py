@@ -83,8 +83,7 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
 def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:
     """Yields the log time and the position of each message that has a fix."""
     extractor = view.extractor
-    for stored in messages:
-        message = view.bags.decode(stored)
-        fix = None if message is None else extractor.geodetic(message, stored.type)
+    for stored, message in view.bags.decoded(messages):
+        fix = extractor.geodetic(message, stored.type)
         if fix is not None and fix.has_fix and math.isfinite(fix.latitude + fix.longitude):
             yield stored.time, fix

@@ -100,7 +100,7 @@ def newest_pose(
         stored = view.stream.newest(topic, window)
     else:
         stored = view.sessions.newest(topic, window, recording)
-    message = None if stored is None else view.bags.decode(stored)
+    message = view.bags.decode(stored)
     if stored is None or message is None:
         return None
     return stored, view.extractor.pose(message, stored.type)

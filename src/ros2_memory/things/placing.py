@@ -275,10 +275,8 @@ class Placer:
         Messages are read, since covariances have no columns. See `_sigma_ahead`.
         """
         said: list[tuple[Ns, float]] = []
-        for message in self._localiser_messages(session, window):
-            decoded = self._view.bags.decode(message)
-            if decoded is None:
-                continue
+        messages = self._localiser_messages(session, window)
+        for message, decoded in self._view.bags.decoded(messages):
             frame = self._view.extractor.frame(decoded).lstrip("/")
             pose = getattr(decoded, "pose", None)
             sigma = _sigma_ahead(getattr(pose, "covariance", None))

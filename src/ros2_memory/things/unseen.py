@@ -206,7 +206,7 @@ def _hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     image may have been looked at until then.
     """
     newest = view.stream.newest(topic, window)
-    stamp = None if newest is None else stamp_of(view.bags.decode(newest))
+    stamp = stamp_of(view.bags.decode(newest))
     if newest is None or not stamp or newest.time - stamp <= LONGEST_LATENCY_NS:
         return None
     before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
