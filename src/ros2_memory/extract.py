@@ -38,9 +38,9 @@ from ros2_memory.messages.conversions import (
     Segments,
     ValueKind,
     descend,
-    euler,
-    field_table_of_class,
-    kind_of,
+    euler_of,
+    layout_of,
+    layout_of_class,
     names_beside,
     names_of,
     nanoseconds,
@@ -49,7 +49,6 @@ from ros2_memory.messages.conversions import (
     parse_path,
     quadruple,
     rotation,
-    summaries_of,
     triple,
     unit,
     view,
@@ -552,7 +551,7 @@ def _convert(name: str, node: object) -> object:
         return node if point is None else dict(zip("xyz", map(Metric, point), strict=True))
     if name == "orientation" and len(node) == 4:
         turn = _px4_rotation(node)
-        return None if turn is None else euler(dict(zip("xyzw", turn, strict=True)))
+        return None if turn is None else euler_of(turn)
     return node
 
 
@@ -564,12 +563,11 @@ def _getter(message: object, path: Segments) -> Callable[[object], object] | Non
     attributes, node = [], message
     for name in path:
         cls: type = type(node)
-        table = field_table_of_class(cls)
-        is_plain = table is not None and kind_of(node) is ValueKind.PLAIN
-        if table is None or not is_plain or name in summaries_of(table):
+        layout = layout_of_class(cls)
+        if layout is None or layout.kind is not ValueKind.PLAIN or name not in layout.fields:
             return None
-        attribute = table.attributes.get(name)
-        if attribute is None:
+        attribute, summarize = layout.fields[name]
+        if summarize is not None:
             return None
         attributes.append(attribute)
         node = getattr(node, attribute)
@@ -580,7 +578,9 @@ def _plain(node: object) -> object:
     """Returns a node for a full path in the message: a quaternion stays x, y, z, w."""
     if isinstance(node, list):
         return [_plain(element) for element in node]
-    numbers = xyzw(node) if kind_of(node) is ValueKind.QUATERNION else None
+    layout = layout_of(node)
+    is_turn = layout is not None and layout.kind is ValueKind.QUATERNION
+    numbers = xyzw(node) if is_turn else None
     return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
 
 

@@ -2,7 +2,7 @@
 
 Replies and conditions see the extracted view of a message: a quaternion as `roll_deg`, `pitch_deg`
 and `yaw_deg`, a time as one number, and the data of images, point clouds and maps as summaries.
-`view` steps through it; `kind_of` and `summaries_of` return what differs from the message.
+`view` steps through it; a `Layout` says what differs from the message.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence, Sized
 from enum import Enum, auto
 from functools import lru_cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -41,38 +41,66 @@ Segments: TypeAlias = tuple[str, ...]
 _PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.([A-Za-z][A-Za-z0-9_]*|[0-9]+))*")
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class FieldTable:
-    """The type of a message class, and the attribute of each field of its definition."""
+class ValueKind(Enum):
+    """How the extracted view shows a message."""
 
-    type: str
-    attributes: Mapping[str, str]
+    PLAIN = auto()  # field by field
+    VECTOR = auto()  # field by field, each a `Metric`
+    QUATERNION = auto()  # as Euler angles
+    TIME = auto()  # as one number of seconds
 
 
-def field_table_of(node: object) -> FieldTable | None:
-    """Returns the fields of a message; None for a number, a list, a mapping and the like."""
+class MessageField(NamedTuple):
+    """A field of the messages of a class.
+
+    Attributes:
+        attribute: of the message object.
+        summarize: a function of the message and the field's value; None if it is shown in full.
+    """
+
+    attribute: str
+    summarize: Callable[[object, object], object] | None = None
+
+
+class Layout(NamedTuple):
+    """How the extracted view shows the messages of a class.
+
+    Attributes:
+        fields: by their names in the definition.
+        kind: how the view shows them.
+    """
+
+    fields: Mapping[str, MessageField]
+    kind: ValueKind = ValueKind.PLAIN
+
+
+def layout_of(node: object) -> Layout | None:
+    """Returns the layout of a message; None for a number, a list, a mapping and the like."""
     cls: type = type(node)
-    table = field_table_of_class(cls)
-    if table is not None or cls.__module__ in {"builtins", "numpy"}:
-        return table
-    names = {name: name for name in getattr(node, "__dict__", {}) if not name.startswith("_")}
-    return FieldTable("", names) if names else None
+    layout = layout_of_class(cls)
+    if layout is not None or cls.__module__ in {"builtins", "numpy"}:
+        return layout
+    names = [name for name in getattr(node, "__dict__", {}) if not name.startswith("_")]
+    return Layout({name: MessageField(name) for name in names}) if names else None
 
 
 @lru_cache(maxsize=4096)
-def field_table_of_class(cls: type) -> FieldTable | None:
-    """Returns the fields of the messages of a dataclass; None for any other class."""
+def layout_of_class(cls: type) -> Layout | None:
+    """Returns the layout of the messages of a dataclass; None for any other class."""
     if not dataclasses.is_dataclass(cls):
         return None
-    attributes: dict[str, str] = {}
+    type_name = str(getattr(cls, "__msgtype__", ""))
+    summaries = _SUMMARIES.get(type_name, {})
+    fields: dict[str, MessageField] = {}
     for field in dataclasses.fields(cls):
         # rosbags imports ClassVar for type checkers only, so that dataclasses takes the constants
         # of a definition for fields; the annotation's text still distinguishes them.
         is_constant = isinstance(field.type, str) and field.type.startswith("ClassVar")
         if not is_constant and field.name != "structure_needs_at_least_one_member":
             bare = field.name.removesuffix("_")  # which rosbags appends to Python's keywords
-            attributes[bare if keyword.iskeyword(bare) else field.name] = field.name
-    return FieldTable(str(getattr(cls, "__msgtype__", "")), attributes)
+            name = bare if keyword.iskeyword(bare) else field.name
+            fields[name] = MessageField(field.name, summaries.get(name))
+    return Layout(fields, kind_of_type(type_name, [*fields]))
 
 
 def field_of(node: object, name: str) -> object:
@@ -82,10 +110,10 @@ def field_of(node: object, name: str) -> object:
     """
     if isinstance(node, dict):
         return node.get(name, ABSENT)
-    table = field_table_of(node)
-    if table is None or name not in table.attributes:
+    layout = layout_of(node)
+    if layout is None or name not in layout.fields:
         return ABSENT
-    return getattr(node, table.attributes[name], ABSENT)
+    return getattr(node, layout.fields[name].attribute, ABSENT)
 
 
 def names_of(node: object) -> tuple[str, ...]:
@@ -94,8 +122,8 @@ def names_of(node: object) -> tuple[str, ...]:
         node = node[0] if node else None
     if isinstance(node, dict):
         return tuple(str(name) for name in node)
-    table = field_table_of(node)
-    return () if table is None else tuple(table.attributes)
+    layout = layout_of(node)
+    return () if layout is None else tuple(layout.fields)
 
 
 def parse_path(path: str) -> Segments | None:
@@ -223,30 +251,6 @@ class Degrees(float):
     __slots__ = ()
 
 
-class ValueKind(Enum):
-    """How the extracted view shows a message."""
-
-    PLAIN = auto()  # field by field
-    VECTOR = auto()  # field by field, each a `Metric`
-    QUATERNION = auto()  # as Euler angles
-    TIME = auto()  # as one number of seconds
-
-
-def kind_of(node: object) -> ValueKind:
-    """Returns how the extracted view shows a node; PLAIN if it is no message."""
-    cls: type = type(node)
-    return kind_of_class(cls)
-
-
-@lru_cache(maxsize=4096)
-def kind_of_class(cls: type) -> ValueKind:
-    """Returns how the extracted view shows the nodes of a class."""
-    table = field_table_of_class(cls)
-    if table is None:
-        return ValueKind.PLAIN
-    return kind_of_type(table.type, [*table.attributes])
-
-
 def kind_of_type(name: str, fields: Sequence[str]) -> ValueKind:
     """Returns how the extracted view shows messages of a type with these fields."""
     kind, names = _KINDS.get(name, (ValueKind.PLAIN, ""))
@@ -256,7 +260,7 @@ def kind_of_type(name: str, fields: Sequence[str]) -> ValueKind:
 
 def view(node: object, name: str) -> object:
     """Returns a field of the extracted view of a message; ABSENT if it has no such field."""
-    kind = kind_of(node)
+    fields, kind = layout_of(node) or Layout({})
     if kind is ValueKind.TIME:
         return ABSENT
     if kind is ValueKind.QUATERNION:
@@ -267,20 +271,14 @@ def view(node: object, name: str) -> object:
     value = field_of(node, name)
     if kind is ValueKind.VECTOR:
         return Metric(value) if isinstance(value, float) else value
-    table = None if value is ABSENT else field_table_of(node)
-    summarize = None if table is None else summaries_of(table).get(name)
-    return value if summarize is None else summarize(node, value)
+    summarize = fields[name].summarize if name in fields else None
+    return value if summarize is None or value is ABSENT else summarize(node, value)
 
 
 class Summary(dict[str, V]):
     """Stands for a large array: its size and shape without its content."""
 
     __slots__ = ()
-
-
-def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
-    """Returns by field what summarizes it: a function of the message and the field's value."""
-    return _SUMMARIES.get(table.type, {})
 
 
 _NUMBERS: Final = (int, float, np.number)  # as a tuple: a union is made anew with each call

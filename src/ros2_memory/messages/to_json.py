@@ -9,8 +9,7 @@ million numbers.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
@@ -20,21 +19,19 @@ from ros2_memory.messages.conversions import (
     ABSENT,
     Array,
     Degrees,
-    FieldTable,
+    Layout,
     Metric,
     Summary,
     ValueKind,
     euler,
-    field_table_of,
-    field_table_of_class,
-    kind_of_class,
+    layout_of,
+    layout_of_class,
     nanoseconds,
-    summaries_of,
     xyz,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
@@ -55,6 +52,7 @@ _SIGNIFICANT_DIGITS: Final = 11
 """Of a number of unknown unit: 1e-8 of a degree, also at a longitude of three digits."""
 _LEAST_DECIMALS: Final = 6
 """Of a number of unknown unit: a time in Unix seconds keeps its microseconds."""
+_REALS: Final = (int, float)  # as a tuple: a union is made anew with each call
 _LARGEST_WHOLE: Final = 10**15
 _LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
 
@@ -125,73 +123,12 @@ def evenly(count: int, at_most: int) -> list[int]:
     return [nth * (count - 1) // (at_most - 1) for nth in range(at_most)]
 
 
-class NumberWriter(NamedTuple):
-    """How numbers are written, by what they measure. Times are in ns, and become Unix seconds."""
-
-    integer: Callable[[int], JsonValue]
-    real: Callable[[float], JsonValue]
-    metric: Callable[[float], JsonValue]
-    degrees: Callable[[float], JsonValue]
-    single: Callable[[np.float32], JsonValue]
-    seconds: Callable[[Ns], JsonValue]
-
-
-_EXACT: Final = NumberWriter(int, float, float, float, float, unix_from_ns)
-_ROUNDED: Final = NumberWriter(
-    round_integer,
-    round_real,
-    round_metric,
-    round_degrees,
-    round_single,
-    lambda time: _whole_or_null(unix_rounded_up(time)),
-)
-
-
-class _FieldLayout(NamedTuple):
-    """A field of a message class.
-
-    Attributes:
-        name: in the definition.
-        attribute: of the message object.
-        summarize: a function of the message and the field's value; None if it is written in full.
-    """
-
-    name: str
-    attribute: str
-    summarize: Callable[[object, object], object] | None
-
-
-class _Layout(NamedTuple):
-    """How the messages of a class are written."""
-
-    kind: ValueKind
-    fields: tuple[_FieldLayout, ...]
-
-
-@lru_cache(maxsize=4096)
-def _layout_of_class(cls: type) -> _Layout | None:
-    """Returns the layout of the messages of a dataclass; None for any other class."""
-    table = field_table_of_class(cls)
-    return None if table is None else _layout_of_table(kind_of_class(cls), table)
-
-
-def _layout_of_table(kind: ValueKind, table: FieldTable) -> _Layout:
-    summaries = summaries_of(table)
-    fields = [
-        _FieldLayout(name, attribute, summaries.get(name))
-        for name, attribute in table.attributes.items()
-    ]
-    return _Layout(kind, tuple(fields))
-
-
 class ExactJson:
     """Renders one message in full. Never raises because of its content.
 
     Args:
         limit: a byte array of more bytes is summarized.
     """
-
-    write = _EXACT
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -202,38 +139,26 @@ class ExactJson:
             return self._text(node, path)
         if node is None or node is ABSENT or isinstance(node, bool):
             return node if isinstance(node, bool) else None
-        if isinstance(node, int):
-            return self.write.integer(int(node))
-        if isinstance(node, float):
-            return self._float(node)
+        if isinstance(node, _REALS):
+            return self._number(node)
         if depth >= MAX_DEPTH:
             note = f"{_named(path)}: parts deeper than {MAX_DEPTH} levels are left out"
             self.note("depth", path, note)
             return None
         return self._container(node, path, depth + 1)
 
-    def _float(self, number: float) -> JsonValue:
-        if isinstance(number, Metric):
-            return self.write.metric(number)
-        if isinstance(number, Degrees):
-            return self.write.degrees(number)
-        return self.write.real(number)
-
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         """Renders anything but plain texts, numbers and None."""
         cls: type = type(node)
-        layout = _layout_of_class(cls)
+        layout = layout_of_class(cls) or layout_of(node)  # mostly the first, which is quicker
         if layout is not None:
             return self._message(node, layout, path, depth)
+        if isinstance(node, bytes | bytearray):
+            node = np.frombuffer(node, dtype=np.uint8)
         if isinstance(node, np.ndarray):
             return self._array(node, path, depth)
         if isinstance(node, np.generic):
             return self._scalar(node, path)
-        if isinstance(node, bytes | bytearray):
-            return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
-        return self._plain_container(node, path, depth)
-
-    def _plain_container(self, node: object, path: str, depth: int) -> JsonValue:
         if isinstance(node, list | tuple):
             return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
@@ -242,25 +167,21 @@ class ExactJson:
                 for name, inner in self._entries(node, path)
             }
             return Summary(rendered) if isinstance(node, Summary) else rendered
-        table = field_table_of(node)
-        if table is None:
-            return self._text(f"<{type(node).__name__}>", path)
-        return self._message(node, _layout_of_table(ValueKind.PLAIN, table), path, depth)
+        return self._text(f"<{type(node).__name__}>", path)
 
-    def _message(self, node: object, layout: _Layout, path: str, depth: int) -> JsonValue:
+    def _message(self, node: object, layout: Layout, path: str, depth: int) -> JsonValue:
         kind = layout.kind
         if kind is ValueKind.QUATERNION:
             return self._rotation(node, path)
         if kind is ValueKind.TIME:
             time = nanoseconds(node)
-            return None if time is None else self.write.seconds(time)
+            return None if time is None else self._seconds(time)
         vector = xyz(node) if kind is ValueKind.VECTOR else None
         if vector is not None:
-            x, y, z = vector
-            metric = self.write.metric
-            return {"x": metric(x), "y": metric(y), "z": metric(z)}
+            x, y, z = map(self._number, map(Metric, vector))
+            return {"x": x, "y": y, "z": z}
         fields: JsonObject = {}
-        for name, attribute, summarize in layout.fields:
+        for name, (attribute, summarize) in layout.fields.items():
             value: object = getattr(node, attribute, ABSENT)
             if summarize is not None:
                 value = summarize(node, value)
@@ -273,7 +194,7 @@ class ExactJson:
             note = f"{_named(path)}: no rotation (a zero or NaN quaternion)"
             self.note("rotation", path, note)
             return None
-        return {name: self.write.degrees(angle) for name, angle in angles.items()}
+        return {name: self._number(angle) for name, angle in angles.items()}
 
     def _array(self, array: Array, path: str, depth: int) -> JsonValue:
         if array.ndim == 0:
@@ -286,14 +207,20 @@ class ExactJson:
 
     def _scalar(self, scalar: np.generic[object], path: str) -> JsonValue:
         if isinstance(scalar, np.float32):
-            return self.write.single(scalar)
+            return self._number(scalar)
         if isinstance(scalar, np.floating):
-            return self.write.real(float(scalar))
+            return self._number(float(scalar))
         plain = scalar.item()
         is_plain = isinstance(plain, bool | int | bytes)
         return self.value(plain if is_plain else str(plain), path, MAX_DEPTH - 1)
 
-    # What a reply shortens, and notes.
+    # What a reply rounds or shortens, and notes.
+
+    def _number(self, number: float | np.float32, /) -> JsonValue:
+        return int(number) if isinstance(number, int) else float(number)
+
+    def _seconds(self, time: Ns, /) -> JsonValue:
+        return unix_from_ns(time)
 
     def _text(self, text: str, _path: str, /) -> JsonValue:
         return str(text)
@@ -323,8 +250,6 @@ class ReplyJson(ExactJson):
             their usual length, and JSON objects to `limit` entries.
     """
 
-    write = _ROUNDED
-
     def __init__(self, limit: int, squeeze: int = 1) -> None:
         super().__init__(limit)
         self._max_text = max(MAX_TEXT // squeeze, MAX_TEXT // MAX_SQUEEZE)
@@ -339,6 +264,18 @@ class ReplyJson(ExactJson):
         if more > 0:
             notes[MAX_NOTES:] = [f"and {more} more notes of this kind"]
         return tuple(notes)
+
+    def _number(self, number: float | np.float32, /) -> JsonValue:
+        if isinstance(number, int):
+            return round_integer(int(number))
+        if isinstance(number, Metric):
+            return round_metric(number)
+        if isinstance(number, Degrees):
+            return round_degrees(number)
+        return round_single(number) if isinstance(number, np.float32) else round_real(number)
+
+    def _seconds(self, time: Ns, /) -> JsonValue:
+        return _whole_or_null(unix_rounded_up(time))
 
     def _text(self, text: str, path: str, /) -> JsonValue:
         if len(text) > self._max_text:
