@@ -270,7 +270,7 @@ class _Reading:
         if self.index.contradiction:
             yield self._contradiction()
         try:
-            yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
+            yield from merged(self._runs(newest_first=newest_first))
         except _ContradictedError as error:
             # Raised in place of a run: what was yielded lies before all messages of the run.
             wrong, self.index = self.index, self._index_without(error)
@@ -279,7 +279,7 @@ class _Reading:
             missed = _missed_span(wrong, self.index, self._wanted, read)
             if missed is not None:
                 yield LostError(str(error), *missed)
-            yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
+            yield from merged(self._runs(newest_first=newest_first))
 
     def batches(self, bare: Collection[str]) -> Iterator[Batch | LostError]:
         """Yields the messages many at once, and errors where some are lost."""
@@ -407,36 +407,31 @@ class _Reading:
                 lost = self._lost_with(chunk, str(error))
                 if lost is None:
                     return None
-                at = lost.last if newest_first else lost.first
-                return RunRows([at], [0], lambda _place, _time: lost)
-            messages = self._verified_messages(content, wanted)
-            times, places = self._wanted_inside(messages, wanted)
+                key = -lost.last if newest_first else lost.first
+                return RunRows([key], [0], lambda _place: lost)
+            times, places = self._inside(self._verified_messages(content, wanted))
             if not times.size:
                 return None
             if newest_first:
-                times, places = times[::-1], places[::-1]
-            if len(content.buffer) <= _LARGE_BYTES:
-                fetch = partial(self._record, content.buffer, wanted)
-                return RunRows(times.tolist(), places.tolist(), fetch)
+                times, places = -times[::-1], places[::-1]
+            kept = content if len(content.buffer) <= _LARGE_BYTES else None
 
-            def fetch_again(place: int, time: Ns) -> Record:
-                return self._record(read_chunk(chunk).buffer, wanted, place, time)
+            def fetch(place: int) -> Record:
+                return self._record((kept or read_chunk(chunk)).buffer, wanted, place)
 
-            return RunRows(times.tolist(), places.tolist(), fetch_again)
+            return RunRows(times.tolist(), places.tolist(), fetch)
 
         if wanted:
             self._verify_beside()
         for chunk in _chunks_of(self.index, wanted, self._window):
-            yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(read_rows, chunk))
+            key, rank = chunk.start, chunk.offset
+            if newest_first:
+                key, rank = -chunk.end, -chunk.offset
+            yield SortedRun(key, rank, partial(read_rows, chunk))
 
-    def _wanted_inside(
-        self, messages: MessageTable, wanted: Collection[int]
-    ) -> tuple[IntArray, IntArray]:
-        """Returns log times and offsets of the wanted messages inside the window, in order."""
-        channels, numbers = messages.channels, [*wanted]
-        # One channel, as in most questions, is compared in a tenth of the time.
-        is_wanted = channels == numbers[0] if len(numbers) == 1 else np.isin(channels, numbers)
-        times, offsets = messages.times[is_wanted], messages.offsets[is_wanted]
+    def _inside(self, messages: MessageTable) -> tuple[IntArray, IntArray]:
+        """Returns log times and offsets of the messages inside the window, in order."""
+        times, offsets = messages.times, messages.offsets
         if (times[1:] <= times[:-1]).any():
             order = np.lexsort((offsets, times))
             times, offsets = times[order], offsets[order]
@@ -449,7 +444,7 @@ class _Reading:
         first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
         with suppress(UnreadableError), as_unreadable():
             messages = read_trusted_index(chunk, self._index_bytes(chunk), self._wanted)
-            times, _ = self._wanted_inside(messages, self._wanted)
+            times, _ = self._inside(messages)
             if not times.size:
                 return None
             first, last = int(times[0]), int(times[-1])
@@ -482,8 +477,7 @@ class _Reading:
 
         Args:
             content: the chunk.
-            wanted: the channels that are needed; None for all. Of a chunk without message indexes
-                all are returned.
+            wanted: the channels that are needed; None for all.
 
         Raises:
             _ContradictedError: the indexes do not agree with the records.
@@ -497,6 +491,7 @@ class _Reading:
             return messages
         if chunk.index_places is None:
             messages = walk_chunk(content.buffer).messages
+            messages = messages.select(np.isin(messages.channels, [*channels]))
         else:
             try:
                 messages = read_trusted_index(chunk, content.indexes[0], channels)
@@ -524,9 +519,9 @@ class _Reading:
     def _index_bytes(self, chunk: Chunk) -> bytes:
         return self._file.read(chunk.offset + chunk.length, chunk.index_length)
 
-    def _record(self, data: bytes, channels: Mapping[int, Channel], place: int, time: Ns) -> Record:
+    def _record(self, data: bytes, channels: Mapping[int, Channel], place: int) -> Record:
         """Returns the message at a verified place of a decompressed chunk."""
-        _, length, number, _, _, published = MESSAGE.unpack_from(data, place)
+        _, length, number, _, time, published = MESSAGE.unpack_from(data, place)
         channel = channels[number]
         payload = data[place + MESSAGE.size : place + RECORD.size + length]
         if payload.startswith(FRAME_MAGIC):

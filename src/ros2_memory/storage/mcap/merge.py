@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from ros2_memory.core.timebase import Ns
-
 T = TypeVar("T")
 
 
@@ -22,44 +20,28 @@ class RunRows(NamedTuple, Generic[T]):
     """The messages of one run in output order.
 
     Attributes:
-        times: log times; descending for newest first, with equal ones in reverse file order.
-        places: offsets in the chunk.
-        fetch: returns a message by its place and log time.
+        keys: their log times, ascending; negative for newest first.
+        places: offsets in the chunk; of messages with equal keys in output order.
+        fetch: returns a message by its place.
     """
 
-    times: list[Ns]
+    keys: list[int]
     places: list[int]
-    fetch: Callable[[int, Ns], T]
+    fetch: Callable[[int], T]
 
 
 class SortedRun(NamedTuple, Generic[T]):
-    """A part of a file.
+    """A part of a file that was not read yet; compared by its first two fields, as `_Open` is.
 
     Attributes:
-        first: no message of the part has an earlier log time.
-        last: no message of the part has a later log time.
-        rank: the position of the part in the file, which no other run has.
+        key: no message of the part has a lower one.
+        rank: breaks ties of keys: where the part is in the file; negative for newest first.
         rows: reads the part; called only when it can hold the next message.
     """
 
-    first: Ns
-    last: Ns
+    key: int
     rank: int
     rows: Callable[[], RunRows[T] | None]
-
-
-class _Waiting(NamedTuple, Generic[T]):
-    """A run that was not read yet; compared by its first two fields, as `_Open` is.
-
-    Attributes:
-        key: no message of the run comes earlier; a log time, negative for newest first.
-        rank: breaks ties of keys; negative for newest first.
-        run: the run.
-    """
-
-    key: Ns
-    rank: int
-    run: SortedRun[T]
 
 
 class _Open(NamedTuple, Generic[T]):
@@ -67,48 +49,39 @@ class _Open(NamedTuple, Generic[T]):
 
     Attributes:
         key: the key of its next message.
-        rank: breaks ties of keys.
+        rank: of the run.
         position: which of its rows is the next message.
         rows: the messages.
-        keys: the key of each of its rows.
     """
 
-    key: Ns
+    key: int
     rank: int
     position: int
     rows: RunRows[T]
-    keys: list[Ns]
 
 
-def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
-    """Yields the messages of all runs by log time, ties in file order; or exactly the reverse.
+def merged(runs: Iterable[SortedRun[T]]) -> Iterator[T]:
+    """Yields the messages of all runs in the order of keys; ties in the order of ranks.
 
     A run is read only when it can hold the next message, and dropped at its end: only the runs that
     overlap in time are in memory.
     """
-    if newest_first:
-        waiting = [_Waiting(-run.last, -run.rank, run) for run in runs]
-    else:
-        waiting = [_Waiting(run.first, run.rank, run) for run in runs]
-    waiting.sort(reverse=True)  # the next to be read is the last of the list
+    waiting = sorted(runs, reverse=True)  # the next to be read is the last of the list
     heap: list[_Open[T]] = []
     while waiting or heap:
-        while waiting and (not heap or waiting[-1].key <= heap[0].key):
-            _, rank, run = waiting.pop()
-            rows = run.rows()
+        if waiting and (not heap or waiting[-1].key <= heap[0].key):
+            _, rank, read = waiting.pop()
+            rows = read()
             if rows is not None:
-                keys = [-time for time in rows.times] if newest_first else rows.times
-                heappush(heap, _Open(keys[0], rank, 0, rows, keys))
-            del rows, run
-        if not heap:
+                heappush(heap, _Open(rows.keys[0], rank, 0, rows))
+            del rows, read
             continue
-        _, rank, position, rows, keys = heappop(heap)
-        other_key = min(heap[0].key if heap else math.inf, waiting[-1].key if waiting else math.inf)
+        _, rank, position, rows = heappop(heap)
+        next_keys = [run.key for run in heap[:1]] + [run.key for run in waiting[-1:]]
+        other_key = min(next_keys, default=math.inf)
         # At a tie with another run, the lower rank goes first, one message at a time.
-        stop = max(bisect_left(keys, other_key, position), position + 1)
-        fetch = rows.fetch
-        for place, time in zip(rows.places[position:stop], rows.times[position:stop], strict=True):
-            yield fetch(place, time)
-        if stop < len(keys):
-            heappush(heap, _Open(keys[stop], rank, stop, rows, keys))
-        del rows, keys, fetch  # and the decompressed chunk, before the next is read
+        stop = max(bisect_left(rows.keys, other_key, position), position + 1)
+        yield from map(rows.fetch, rows.places[position:stop])
+        if stop < len(rows.keys):
+            heappush(heap, _Open(rows.keys[stop], rank, stop, rows))
+        del rows  # and the decompressed chunk, before the next is read
