@@ -22,7 +22,6 @@ from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.config_sources import quoted
 from ros2_memory.recorder.__main__ import main
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -156,8 +155,8 @@ def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) ->
     assert str(site.topics) in starting["files"]
     (recording,) = daemon.recordings()
     assert (recording / "metadata.yaml").exists()
-    states = {McapReader().closing(path) for path in recording.glob("*.mcap")}
-    assert states == {Closing.CLOSED}
+    states = {McapReader().is_finished(path) for path in recording.glob("*.mcap")}
+    assert states == {True}
 
 
 def test_what_a_crash_left_is_repaired_and_bags_of_another_program_outlive_every_limit(

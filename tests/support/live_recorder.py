@@ -28,7 +28,6 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
@@ -400,7 +399,7 @@ def moment_of(event: Mapping[str, Any]) -> int:
 
 def _is_closed(reader: McapReader, path: Path) -> bool:
     with suppress(BagError, FileNotFoundError):
-        return path.stat().st_size > 0 and reader.closing(path) is Closing.CLOSED
+        return path.stat().st_size > 0 and reader.is_finished(path)
     return False
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 
 
@@ -55,11 +54,11 @@ class PlainReader(McapReader):
     def reads(self, path: Path) -> bool:
         return path.name.endswith(self.kinds)
 
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         self.closings[path.name] += 1
         text = _text(path)
         left_open = text.startswith("BAG") and not text.endswith("END")
-        return Closing.OPEN if left_open else Closing.CLOSED
+        return not left_open
 
     def summarize(self, path: Path) -> BagSummary:
         self.summaries[path.name] += 1

@@ -42,7 +42,6 @@ from ros2_memory.storage.base import (
     BagReader,
     Batch,
     Channel,
-    Closing,
     Definition,
     Record,
     errors_as_items,
@@ -79,13 +78,13 @@ class BagDirReader(BagReader):
         """Returns what the adapter returns."""
         return self.reader.reads(path)
 
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         """Returns whether the writer has finished the file.
 
         Raises:
             BagError: see the adapter; or the path leads out of the bag directory.
         """
-        return self.reader.closing(self._confined(path))
+        return self.reader.is_finished(self._confined(path))
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns counts and times of the messages that count in this recording.

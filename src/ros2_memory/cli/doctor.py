@@ -61,7 +61,6 @@ from ros2_memory.results import DataTimeRange
 from ros2_memory.retention.policy import GB
 from ros2_memory.serving.auth import api_token
 from ros2_memory.serving.health import read_health
-from ros2_memory.storage.base import Closing
 
 T = TypeVar("T")
 
@@ -364,7 +363,7 @@ def _remedy(file: SetAside, memory: Memory) -> str:
     if not os.access(file.path, os.R_OK):
         return _READ
     with suppress(BagError):
-        if file.path.suffix == MCAP and memory.reader.closing(file.path) is Closing.OPEN:
+        if file.path.suffix == MCAP and not memory.reader.is_finished(file.path):
             return f"ros2-memory recover {shlex.quote(str(memory.index.bag_dir))}"
     return "copy them again from their source; what is so there, too, cannot be read"
 

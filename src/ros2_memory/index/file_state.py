@@ -44,10 +44,10 @@ from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedEr
 from ros2_memory.core.model import MCAP, UNMARKED_KINDS, BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
-from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.storage.base import BagReader
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """An unreadable file is tried again after this time: the machine may have been at fault."""
@@ -151,7 +151,7 @@ class FileNotes:
         seen_at: when a scan first saw this stat result.
         trusted: whether a later change would show in its mtime.
         grew_at: when a scan last saw it grow.
-        closing: whether its writer has finished; None if not read yet.
+        is_finished: whether its writer has finished; None if not read yet.
         summary: its content; None if not read yet.
         fault: why it cannot be read.
         is_transient: whether the machine may be at fault, not the file.
@@ -163,7 +163,7 @@ class FileNotes:
     seen_at: Ns
     trusted: bool
     grew_at: Ns | None = None
-    closing: Closing | None = None
+    is_finished: bool | None = None
     summary: BagSummary | None = None
     fault: str | None = None
     is_transient: bool = False
@@ -182,7 +182,7 @@ class FileNotes:
         """Sets the content of a file that was read earlier and has not changed."""
         self.summary = summary
         if summary.complete:  # else a recorder may still have it open
-            self.closing = Closing.CLOSED
+            self.is_finished = True
 
     def update(self, stamp: Stamp, now: Ns) -> bool:
         """Notes a new stat result; returns whether the file has to be read again."""
@@ -196,7 +196,7 @@ class FileNotes:
         # The ctime counts too: a file may have the size and mtime of the one that it replaced.
         is_outdated = is_retried or not self.trusted or stamp != self.stamp
         if is_outdated:
-            self.closing, self.summary, self.fault = None, None, None
+            self.is_finished, self.summary, self.fault = None, None, None
             self.is_transient = False
             self.seen_at = now
         self.stamp = stamp
@@ -219,7 +219,7 @@ class FileNotes:
         return (
             not self.trusted
             or classification.state in _WATCHED
-            or self.closing is Closing.OPEN
+            or self.is_finished is False
             or (
                 self.kind in UNMARKED_KINDS
                 and context.now - self.stamp.mtime_ns <= context.three_splits
@@ -238,10 +238,9 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     if context.withheld.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
-        if notes.closing is None and notes.fault is None:
+        if notes.is_finished is None and notes.fault is None:
             # An open MCAP is 0 bytes until its first chunk is full.
-            is_empty = notes.stamp.size == 0
-            notes.closing = Closing.OPEN if is_empty else reader.closing(notes.path)
+            notes.is_finished = notes.stamp.size > 0 and reader.is_finished(notes.path)
         if _is_active(notes, context) and not _is_young_copy(notes, reader, context):
             return _classify_active(notes, reader, context)
         if notes.summary is None and notes.fault is None:
@@ -272,12 +271,12 @@ def files_in_metadata(path: Path) -> frozenset[str]:
 
 
 def _is_active(notes: FileNotes, context: ScanContext) -> bool:
-    if notes.closing is Closing.OPEN:
+    if notes.is_finished is False:
         if context.open_recordings is not None:
             return context.names(notes.path)
         return notes.grew_lately(context)
     return (
-        notes.closing is Closing.CLOSED
+        notes.is_finished is True
         and notes.kind in UNMARKED_KINDS
         and (context.open_recordings is None or context.names(notes.path))
         and notes.grew_lately(context)
@@ -342,7 +341,7 @@ def _summary_so_far(notes: FileNotes, reader: BagReader) -> BagSummary | None:
 
 
 def _classify_readable(notes: FileNotes, summary: BagSummary) -> Classification:
-    is_closed = notes.closing is Closing.CLOSED and summary.complete
+    is_closed = notes.is_finished and summary.complete
     if summary.empty:
         if is_closed and not summary.notes:
             return Classification(FileState.EMPTY, silent=summary.schema.silent)

@@ -23,7 +23,7 @@ from ros2_memory.core.timebase import ns_from_unix, utc_day
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, end_of, unpacked_messages
-from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
+from ros2_memory.storage.base import BagReader, Batch, Channel, Definition, Record, Schema
 from ros2_memory.storage.cache import shared
 
 if TYPE_CHECKING:
@@ -300,9 +300,9 @@ class LakeReader(BagReader):
         """Returns whether a path is a bag of the index, or one that the own reader reads."""
         return self.index.bag(path) is not None or self.own.reads(path)
 
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         """Returns whether the writer has finished a bag; shipped bags are finished."""
-        return Closing.CLOSED if self.index.bag(path) else self.own.closing(path)
+        return bool(self.index.bag(path)) or self.own.is_finished(path)
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns the summary of a bag."""

@@ -51,7 +51,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import enclosing
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.recorder.policies import ClockReading, set_back
-from ros2_memory.storage.base import BagReader, Closing, Record, errors_as_items
+from ros2_memory.storage.base import BagReader, Record, errors_as_items
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -604,8 +604,7 @@ def readable_bags(
     for path in bags_in(recording):
         try:
             if only_closed and (
-                withheld.holds(recording.name, path.name)
-                or reader.closing(path) is not Closing.CLOSED
+                withheld.holds(recording.name, path.name) or not reader.is_finished(path)
             ):
                 continue
             summary = reader.summarize(path)

@@ -35,7 +35,6 @@ from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.command import MESSAGES_LOST
 from ros2_memory.recorder.process.output import Line, LineKind, parse_line
 from ros2_memory.retention.clear import remove_if_empty
-from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception import Reception
+    from ros2_memory.storage.base import BagReader
 
 
 MAX_DISTINCT: Final = 200
@@ -164,7 +164,7 @@ class Splits:
             if split.closed or not split.size:
                 continue
             try:
-                if self.reader.closing(path) is Closing.CLOSED:
+                if self.reader.is_finished(path):
                     split.closed = True
                     closed.append(name)
                     summary = self.reader.summarize(path)

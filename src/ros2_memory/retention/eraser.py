@@ -60,7 +60,6 @@ from ros2_memory.retention.repair import (
     replace_file,
     rewrite_without,
 )
-from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -68,6 +67,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.spans import Spans
+    from ros2_memory.storage.base import BagReader, BagWriter
 
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
@@ -296,7 +296,7 @@ class Eraser:
             reason = _FOREIGN
         elif path.name.endswith(COMPRESSED):
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
-        elif self.reader.closing(path) is Closing.OPEN or not summary.complete:
+        elif not self.reader.is_finished(path) or not summary.complete:
             reason = "a crash left it open; ros2-memory recover closes it"
         # Nothing in a file of such a format shows whether its writer is done.
         elif path.suffix in UNMARKED_KINDS and inode in open_files():

@@ -22,13 +22,13 @@ from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.retention.delete import new_file_beside
-from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Collection, Iterator
 
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import BagReader, BagWriter, Rewritten
 
 Identity = tuple[int, int]
 """A file by its device and inode number."""
@@ -65,7 +65,7 @@ class Repairer:
             BagVanishedError: the file does not exist.
             BagError: the file cannot be opened, or is no MCAP file.
         """
-        is_closed = self.reader.closing(path) is Closing.CLOSED
+        is_closed = self.reader.is_finished(path)
         if is_closed:
             # A file that is no bag at all counts as closed; this raises for it.
             self.reader.channels(path)
@@ -104,7 +104,7 @@ class Repairer:
             here.unlink()
             flush(here.parent)
             return Repaired(0)
-        if self.reader.closing(path) is Closing.CLOSED:
+        if self.reader.is_finished(path):
             return None
         with new_file_beside(here) as new:
             result = self.writer.rewrite(here, new)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -37,13 +36,6 @@ REPEATED_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
 ROS2_PROFILE: Final = "ros2"
 """The profile of every rosbag2 file; other readers of ROS 2 bags refuse every other."""
-
-
-class Closing(StrEnum):
-    """Whether the writer of a file has finished, by the file itself."""
-
-    CLOSED = "closed"
-    OPEN = "open"
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,11 +210,11 @@ class BagReader(ABC):
         """Returns whether this adapter reads such a file, judged by its name alone."""
 
     @abstractmethod
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         """Returns whether the writer has finished the file.
 
         Closing magic for MCAP; no journal or WAL beside a sqlite file; a whole frame for `.zstd`.
-        A file that is not a bag at all counts as closed: `summarize` then raises the reason.
+        A file that is not a bag at all counts as finished: `summarize` then raises the reason.
 
         Raises:
             BagVanishedError: the file is not there.

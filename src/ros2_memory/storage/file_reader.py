@@ -25,7 +25,7 @@ from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.scratch import Scratch
 from ros2_memory.storage.sqlite_bag import SqliteBags, copy_with_journal, journals_beside
-from ros2_memory.storage.zstd_bag import FRAME_MAGIC, closing_of_zstd, unpack
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, is_finished_zstd, unpack
 from ros2_memory.typestore import MessageType, Typestores
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Closing
 
 _HEADER_BYTES: Final = 4
 """The encapsulation header of CDR."""
@@ -218,12 +217,12 @@ class FileReader(BagReader):
         """Returns whether the name ends with one of the four suffixes."""
         return _format_of(path) in self._formats
 
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         """Checks closing magic for MCAP, journals beside a `.db3`, whole frames for `.zstd`."""
         with reading(path):
             if path.suffix == COMPRESSED:
-                return closing_of_zstd(path)
-            return self._formats[path.suffix].closing(path)
+                return is_finished_zstd(path)
+            return self._formats[path.suffix].is_finished(path)
 
     @contextmanager
     def _open(self, path: Path) -> Iterator[tuple[McapBags | SqliteBags, Path, str]]:

@@ -30,7 +30,6 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
     Batch,
     Channel,
-    Closing,
     Record,
     Schema,
     batched,
@@ -141,11 +140,10 @@ class SqliteBags:
         self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
 
-    def closing(self, path: Path) -> Closing:
-        """Returns open if a journal or WAL lies beside the file, or it is empty."""
+    def is_finished(self, path: Path) -> bool:
+        """Returns whether the file has content, and no journal or WAL beside it."""
         with OpenFile(path) as file:
-            unfinished = not file.size or journals_beside(path)
-        return Closing.OPEN if unfinished else Closing.CLOSED
+            return file.size > 0 and not journals_beside(path)
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import zstandard
 
 from ros2_memory.core.large_reads import LARGE_BYTES
-from ros2_memory.storage.base import Channel, Closing
 from ros2_memory.storage.errors import (
     MAX_COMPRESSION_RATIO,
     SizeLimit,
@@ -23,6 +22,8 @@ from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from ros2_memory.storage.base import Channel
 
 
 # As large as a block, so that the data before a damaged block is not lost with it.
@@ -50,11 +51,10 @@ _MAX_BLOCKS: Final = 1_000_000
 """A file of 128 GB has as many full blocks; to go through more, small ones, takes minutes."""
 
 
-def closing_of_zstd(path: Path) -> Closing:
-    """Returns whether the file is made of whole frames; one that is not zstd counts as closed."""
+def is_finished_zstd(path: Path) -> bool:
+    """Returns whether the file is made of whole frames; one that is not zstd counts as finished."""
     with OpenFile(path) as file:
-        is_open = starts_as_zstd(file) and not ends_whole(file)
-    return Closing.OPEN if is_open else Closing.CLOSED
+        return not starts_as_zstd(file) or ends_whole(file)
 
 
 def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:

@@ -46,7 +46,6 @@ from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.retention.repair import reason_of, rewrite_without
-from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
     ExclusionRule,
@@ -64,6 +63,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import BagReader, BagWriter, Record
 
 MOST_AT_ONCE: Final = 16
 """So many splits are released in one step, which is then written down."""
@@ -273,7 +273,7 @@ class Screening:
         """
         is_new = path.name not in screen.files
         try:
-            if is_new and self.reader.closing(path) is not Closing.CLOSED:
+            if is_new and not self.reader.is_finished(path):
                 return None
             summary = self.reader.summarize(path)
             if is_new:

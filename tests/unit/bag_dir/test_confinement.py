@@ -188,7 +188,7 @@ def test_a_file_that_a_link_replaced_since_it_was_listed_is_not_read(
     path = bags / "run" / "run_0.mcap"
     path.unlink()
     path.symlink_to(outside / "rec_0.mcap")
-    for ask in (reader().summarize, reader().closing, reader().channels):
+    for ask in (reader().summarize, reader().is_finished, reader().channels):
         with pytest.raises(BagError, match="symbolic link, which is not followed"):
             ask(path)
 

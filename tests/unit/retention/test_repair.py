@@ -8,7 +8,6 @@ from mcap.records import McapRecord
 
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.retention.repair import Repairer
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -44,7 +43,7 @@ def test_a_bag_that_was_left_open_is_closed_with_its_name_rights_and_time(path: 
     status = path.stat()
     assert (repaired.was_bytes, repaired.is_bytes) == (size, status.st_size)
     assert (status.st_mode & 0o777, status.st_mtime_ns) == (0o640, T0 + 1)
-    assert McapReader().closing(path) is Closing.CLOSED
+    assert McapReader().is_finished(path)
     assert contents(path) == before
     assert files_in(path.parent) == ["a_0.mcap"]
     assert REPAIRER.repair(path) is None

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader, Batch, Closing, Record
+from ros2_memory.storage.base import BagReader, Batch, Record
 from tests.support.bags import Msg, boolean, odom, text, tf, transform
 from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
@@ -183,14 +183,14 @@ def test_what_is_gone_has_vanished_and_what_is_no_bag_is_closed_and_its_fault_re
     path.unlink()
     assert all(isinstance(error, BagVanishedError) for error in refusals(reader, path))
     with pytest.raises(BagVanishedError):
-        reader.closing(path)
+        reader.is_finished(path)
     path.write_bytes(b"FROM ros:jazzy\nRUN true\n" * 30)
-    assert reader.closing(path) is Closing.CLOSED
+    assert reader.is_finished(path)
     for error in refusals(reader, path):
         assert not isinstance(error, BagVanishedError)
         assert error.reason
     path.write_bytes(b"")
-    assert reader.closing(path) is Closing.OPEN
+    assert not reader.is_finished(path)
     with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
         reader.summarize(path)
 
@@ -206,7 +206,7 @@ def test_a_folder_or_a_pipe_in_place_of_a_bag_is_an_error_that_names_it(
         with pytest.raises(BagError, match="not a regular file"):
             shelf.make_reader().summarize(path)
         with pytest.raises(EpisodicError):
-            shelf.make_reader().closing(path)
+            shelf.make_reader().is_finished(path)
 
 
 @on_every_shelf

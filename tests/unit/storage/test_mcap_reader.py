@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader, Closing, Record
+from ros2_memory.storage.base import BagReader, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -286,7 +286,7 @@ def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
         on_disk = sum(end <= size for end in ends)
         assert summary.count == on_disk, size
         assert len(read(reader, path, "/0", "/1")) == on_disk
-        assert reader.closing(path) is Closing.OPEN
+        assert not reader.is_finished(path)
         path.unlink()
 
 
@@ -343,7 +343,7 @@ def test_of_a_compressed_chunk_or_file_that_is_cut_what_can_be_decompressed_coun
     path.write_bytes(whole[: len(whole) // 2])
     reader = Rosbag2Reader()
     summary = reader.summarize(path)
-    assert reader.closing(path) is Closing.OPEN
+    assert not reader.is_finished(path)
     assert 60 < summary.count < 240
     assert not summary.complete
     assert any(note in each for each in summary.notes)

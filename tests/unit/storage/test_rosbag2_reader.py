@@ -16,7 +16,6 @@ import zstandard
 
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.scratch import Scratch
 from tests.support.bags import text, write_db3, write_mcap
@@ -139,7 +138,7 @@ def test_a_transaction_that_was_cut_off_is_rolled_back(tmp_path: Path) -> None:
         shutil.copytree(path.parent, killed)
     assert (killed / "a.db3-journal").stat().st_size
     reader = Rosbag2Reader()
-    assert reader.closing(killed / "a.db3") is Closing.OPEN
+    assert not reader.is_finished(killed / "a.db3")
     assert times(read(reader, killed / "a.db3")) == [0, 1]
 
 
@@ -149,7 +148,7 @@ def test_a_file_of_several_frames_is_read_whole(tmp_path: Path) -> None:
     skippable = b"\x50\x2a\x4d\x18\x04\x00\x00\x00note"
     path, reader = tmp_path / "a.mcap.zstd", Rosbag2Reader()
     path.write_bytes(b"".join((skippable, *frames)))
-    assert reader.closing(path) is Closing.CLOSED
+    assert reader.is_finished(path)
     assert times(read(reader, path)) == list(range(50))
     assert reader.summarize(path).complete
 
@@ -160,7 +159,7 @@ def test_a_compressed_file_is_closed_only_at_the_very_end_of_its_frames(tmp_path
     path, reader, closed = tmp_path / "cut.mcap.zstd", Rosbag2Reader(), []
     for size in range(len(first + second) + 1):
         path.write_bytes((first + second)[:size])
-        if reader.closing(path) is Closing.CLOSED:
+        if reader.is_finished(path):
             closed.append(size)
     # A cut between two whole frames cannot be told from a file that ends there.
     assert closed == [len(first), len(first + second)]

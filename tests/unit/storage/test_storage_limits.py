@@ -274,7 +274,7 @@ def test_a_file_of_more_frames_or_blocks_than_any_writer_makes_is_named(
     for data in (rle_frame(1) * 101, rle_frame(10)[:6] + b"\x08\0\0x" * 1001):
         path.write_bytes(data)
         with pytest.raises(BagError, match="it is made of more than"):
-            Rosbag2Reader().closing(path)
+            Rosbag2Reader().is_finished(path)
 
 
 LONG = "char(0) || hex(zeroblob(17000000))"

@@ -25,7 +25,6 @@ from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.storage.base import (
     Batch,
     Channel,
-    Closing,
     IntArray,
     Record,
 )
@@ -65,8 +64,8 @@ from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
-    closing_of,
     is_finished,
+    starts_as_mcap,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
@@ -133,10 +132,10 @@ class McapBags:
             self._verdicts.clear()
         self._verdicts[hash(file.key)] = verdict
 
-    def closing(self, path: Path) -> Closing:
+    def is_finished(self, path: Path) -> bool:
         """Returns whether the writer has finished the file."""
         with OpenFile(path) as file:
-            return closing_of(file)
+            return is_finished(file) or not starts_as_mcap(file)
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""

@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Statistics
 from mcap.writer import MCAP0_MAGIC
 
-from ros2_memory.storage.base import Channel, Closing, Schema
+from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.cache import shared
 from ros2_memory.storage.errors import (
     MANY_TOPICS,
@@ -206,20 +206,10 @@ def _declaration(opcode: int, body: bytes) -> tuple[int, Schema | mcap_records.C
     return 0, None
 
 
-def closing_of(file: OpenFile) -> Closing:
-    """Returns open if the closing magic is missing; a file that is not MCAP counts as closed."""
-    is_open = starts_as_mcap(file) and not _ends_as_mcap(file)
-    return Closing.OPEN if is_open else Closing.CLOSED
-
-
 def is_finished(file: OpenFile) -> bool:
     """Returns whether a file is MCAP and its writer finished it."""
-    return _ends_as_mcap(file) and starts_as_mcap(file)
-
-
-def _ends_as_mcap(file: OpenFile) -> bool:
-    is_long_enough = file.size >= 2 * MAGIC_SIZE
-    return is_long_enough and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+    ends = file.size >= 2 * MAGIC_SIZE and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+    return ends and starts_as_mcap(file)
 
 
 def starts_as_mcap(file: OpenFile) -> bool:

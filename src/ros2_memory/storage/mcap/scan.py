@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 from mcap.opcode import Opcode
 
 from ros2_memory.core.text import counted
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, MessageTable
@@ -23,8 +22,8 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE,
     Declarations,
     FileRecord,
-    closing_of,
     file_records,
+    is_finished,
     statistics,
 )
 
@@ -205,7 +204,7 @@ class _Scan:
 
     def index(self, note: str) -> McapIndex:
         """Returns the index of the messages found; `note` comes before its other notes."""
-        complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
+        complete = self.data_ended and is_finished(self.file)
         self._close_unchunked()
         contents = self.tally.contents()
         # The summary section is overruled by the data section, and that by the chunks.
