@@ -16,10 +16,11 @@ import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.storage.base import Batch, Channel, Record, Schema, errors_as_items
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
     MAX_DEFINITION_BYTES,
@@ -126,6 +127,26 @@ def test_what_is_larger_or_more_than_allowed_is_left_out_and_named(
         summary = reader.summarize(path)
         assert len([*reader.records(path, ["/chatter"], EVERYTHING)]) == summary.count == 1
     assert said in summary.notes[0]
+
+
+def test_a_chunk_larger_than_allowed_is_refused_before_it_is_in_memory(tmp_path: Path) -> None:
+    path, reader = tmp_path / "run_0.mcap", McapReader(max_chunk_mb=1)
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1024, compression=CompressionType.NONE)
+        writer.start("ros2")
+        declared = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        number = writer.register_channel("/chatter", "cdr", declared)
+        for time, size in ((5, 2000), (6, 40 * MB), (7, 2000)):
+            writer.add_message(number, time, bytes(size), time)
+        writer.finish()
+    with little_memory(10 * MB):
+        [before, lost, behind] = errors_as_items(reader.batches(path, ["/chatter"], EVERYTHING))
+    assert isinstance(lost, BagError)
+    assert lost.lost == (6, 6)
+    assert "larger than the 1 MiB allowed" in lost.reason
+    for batch, time in ((before, 5), (behind, 7)):
+        assert isinstance(batch, Batch)
+        assert batch.log_times.tolist() == [time]
 
 
 def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(

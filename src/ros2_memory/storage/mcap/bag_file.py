@@ -50,6 +50,7 @@ from ros2_memory.storage.mcap.chunk import (
     Chunk,
     MessageTable,
     chunk_data,
+    index_behind,
     read_indexes,
     read_trusted_index,
     walk_chunk,
@@ -378,7 +379,7 @@ class _Reading:
         messages = self._verified_messages(content)
         messages = messages.select(np.isin(messages.channels, [*self._wanted]))
         if yielded is not None:
-            known = read_trusted_index(yielded, self._index_bytes(yielded), yielded.channels)
+            known = read_trusted_index(yielded, index_behind(self._file, yielded), yielded.channels)
             messages = messages.select(~np.isin(messages.offsets, known.offsets))
         yield from self._batches_of(content, messages)
 
@@ -442,7 +443,7 @@ class _Reading:
         window = self._window
         first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
         with suppress(UnreadableError), as_unreadable():
-            messages = read_trusted_index(chunk, self._index_bytes(chunk), self._wanted)
+            messages = read_trusted_index(chunk, index_behind(self._file, chunk), self._wanted)
             times, _ = self._inside(messages)
             if not times.size:
                 return None
@@ -513,10 +514,7 @@ class _Reading:
             with as_unreadable():
                 data = chunk_data(self._file, chunk, self._bags.limit)
             self._bags.chunks.put(key, data, len(data))
-        return ReadChunks([chunk], data, [len(data)], [self._index_bytes(chunk)])
-
-    def _index_bytes(self, chunk: Chunk) -> bytes:
-        return self._file.read(chunk.offset + chunk.length, chunk.index_length)
+        return ReadChunks([chunk], data, [len(data)], [index_behind(self._file, chunk)])
 
     def _record(self, data: bytes, channels: Mapping[int, Channel], place: int) -> Record:
         """Returns the message at a verified place of a decompressed chunk."""

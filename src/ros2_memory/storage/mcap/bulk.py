@@ -23,7 +23,9 @@ from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import (
     Chunk,
     MessageTable,
+    chunk_body,
     decompressed_chunk,
+    index_behind,
     index_groups,
     read_indexes,
     walk_chunk,
@@ -94,8 +96,7 @@ def _read_group(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> Re
     # The caller reads a chunk that fails again, which reports the reason.
     with suppress(UnreadableError), as_unreadable():
         for chunk in chunks:
-            record = file.read(chunk.offset, chunk.length + chunk.index_length)
-            body = record[RECORD.size : chunk.length]
+            body = chunk_body(file, chunk.offset, chunk.length, limit)
             _, _, stated_size, _, _ = CHUNK.unpack_from(body)
             if parts and size + stated_size > BATCH_BYTES:
                 break
@@ -104,7 +105,7 @@ def _read_group(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> Re
             if size > LARGE_BYTES:
                 limit.take_turn()
             parts.append(part)
-            indexes.append(record[chunk.length :])
+            indexes.append(index_behind(file, chunk))
             if size >= BATCH_BYTES:
                 break
     if not parts:

@@ -246,6 +246,11 @@ def index_bytes(indexes: int, messages: int) -> int:
     return indexes * _INDEX.itemsize + messages * _ENTRY.itemsize
 
 
+def index_behind(file: OpenFile, chunk: Chunk) -> bytes:
+    """Returns the message indexes behind a chunk."""
+    return file.read(chunk.offset + chunk.length, chunk.index_length)
+
+
 def index_groups(
     file: OpenFile, chunks: Sequence[Chunk]
 ) -> Iterator[tuple[Sequence[Chunk], list[bytes]]]:
@@ -261,7 +266,7 @@ def index_groups(
         if chunk.index_length > index_bytes(MAX_CHANNELS, MAX_CHUNK_MESSAGES):
             raise UnreadableError(_OTHER_INDEX)
         group.append(chunk)
-        indexes.append(file.read(chunk.offset + chunk.length, chunk.index_length))
+        indexes.append(index_behind(file, chunk))
         size += chunk.index_length
         if size > LARGE_BYTES:
             yield group, indexes
@@ -330,9 +335,12 @@ _HEAD_BYTES: Final = 96
 """The front of the body of a chunk record: all its fields, for any compression."""
 
 
-def chunk_body(file: OpenFile, at: int, size: int, limit: SizeLimit) -> bytes:
-    """Returns the body of a chunk record; of one above the limit, enough to recognise that."""
-    return file.read(at, min(size, limit.max_bytes + _HEAD_BYTES))
+def chunk_body(file: OpenFile, at: int, length: int, limit: SizeLimit) -> bytes:
+    """Returns the body of the chunk record at an offset, of which `length` bytes are in the file.
+
+    Of one above the limit, enough to recognise that.
+    """
+    return file.read(at + RECORD.size, min(length - RECORD.size, limit.max_bytes + _HEAD_BYTES))
 
 
 def chunk_head(body: bytes) -> ChunkHead:
@@ -388,7 +396,7 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
         if chunk.length > LARGE_BYTES:
             limit.take_turn()
         return file.read(chunk.offset, chunk.length)
-    body = chunk_body(file, chunk.offset + RECORD.size, chunk.length - RECORD.size, limit)
+    body = chunk_body(file, chunk.offset, chunk.length, limit)
     return decompressed_chunk(body, limit, is_whole=chunk.usable is None)[: chunk.usable]
 
 
@@ -447,9 +455,9 @@ class ChunkOpener:
             raise UnreadableError(
                 f"its chunks hold more than {MAX_COMPRESSION_RATIO} times what the file does"
             )
-        in_file = min(record.end, self._file.size) - record.body_at
+        in_file = min(record.end, self._file.size) - record.offset
         with as_unreadable():
-            body = chunk_body(self._file, record.body_at, in_file, self._limit)
+            body = chunk_body(self._file, record.offset, in_file, self._limit)
             is_whole = record.end <= self._file.size
             data = decompressed_chunk(body, self._limit, is_whole=is_whole)
             self._bytes += len(data)
