@@ -17,6 +17,7 @@ from ros2_memory.storage.base import SEQUENCE, BagReader, Batch, Channel, Defini
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     LostError,
+    SizeLimit,
     UnreadableError,
     raise_if_lost,
     reading,
@@ -201,15 +202,14 @@ class FileReader(BagReader):
         max_chunk_mb: int = MAX_CHUNK_MB,
         large: LargeReads | None = None,
     ) -> None:
-        large = large or LargeReads()
         self._typestores = Typestores(custom_msg_paths)
         # By identity, since to hash a channel hashes its definition. The channel is kept beside its
         # decoder, or the reason why it has none, so that no other object gets its identity.
         self._decoders: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
-        self._large = large
+        self._limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
         self._formats: dict[str, McapBags | SqliteBags] = {
-            MCAP: McapBags(cache_mb, max_chunk_mb, large),
-            SQLITE: SqliteBags(max_chunk_mb, large),
+            MCAP: McapBags(cache_mb, self._limit),
+            SQLITE: SqliteBags(self._limit),
         }
         self._scratch = Scratch(unpack_max_mb << 20)
 
@@ -301,7 +301,7 @@ class FileReader(BagReader):
     def decode(self, record: Record) -> object:
         """Decodes the message of a record."""
         if len(record.payload) > MUCH_DECODED_BYTES:
-            self._large.acquire()
+            self._limit.take_turn()
         channel = record.channel
         decoder = self._decoder(channel)
         if isinstance(decoder, str):

@@ -23,7 +23,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
+from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
@@ -131,13 +131,11 @@ class SqliteBags:
     (`errors.reading`).
 
     Args:
-        max_message_mb: size up to which a message, or another value of a file, is read, in MiB.
-        large: the turn to hold much of a bag.
+        limit: up to which a message, or another value of a file, is read.
     """
 
-    def __init__(self, max_message_mb: int, large: LargeReads) -> None:
-        self._large = large
-        self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
+    def __init__(self, limit: SizeLimit) -> None:
+        self._limit = limit
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
 
     def is_finished(self, path: Path) -> bool:
@@ -210,7 +208,7 @@ class SqliteBags:
                 if stored_key != [time, number]:
                     raise UnreadableError("damaged: a message is not the one that an index names")
                 if len(stored) > LARGE_BYTES:
-                    self._large.acquire()
+                    self._limit.take_turn()
                 payload = uncompressed_payload(wanted[number], stored, self._limit)
                 yield Record(wanted[number], time, time, payload)
 
@@ -220,7 +218,7 @@ class SqliteBags:
         """Yields the messages of `records`, many at once; see `BagReader.batches`."""
         del bare
         if path.stat().st_size > LARGE_BYTES:
-            self._large.acquire()
+            self._limit.take_turn()
         yield from batched(enumerate(self.records(path, topics, window, newest_first=False)))
 
     def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:

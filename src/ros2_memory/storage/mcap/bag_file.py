@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES, BagSummary
-from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.storage.base import (
@@ -105,17 +104,11 @@ class McapBags:
 
     Args:
         cache_mb: memory that indexes and decompressed chunks may take between calls, in MiB.
-        max_chunk_mb: decompressed size up to which a chunk is read, in MiB.
-        large: the turn to hold much of a bag.
+        limit: up to which a chunk is read.
     """
 
-    def __init__(
-        self,
-        cache_mb: int,
-        max_chunk_mb: int,
-        large: LargeReads | None = None,
-    ) -> None:
-        self.limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
+    def __init__(self, cache_mb: int, limit: SizeLimit) -> None:
+        self.limit = limit
         # Many programs write chunks of 4 MiB.
         self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) * 3 // 4)
         self.indexes: ByteLru[McapIndex | MessageTable] = ByteLru((cache_mb << 20) // 4)

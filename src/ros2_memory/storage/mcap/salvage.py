@@ -53,10 +53,10 @@ class Salvage:
         lost_bytes: bytes of the file that made no whole record; final when `records` has ended.
     """
 
-    def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
+    def __init__(self, file: OpenFile, limit: SizeLimit) -> None:
         self._file = file
-        self._max_chunk_bytes = max_chunk_bytes
-        self._opener = ChunkOpener(file, SizeLimit(max_chunk_bytes))
+        self._limit = limit
+        self._opener = ChunkOpener(file, limit)
         self.lost_bytes = 0
 
     def records(self) -> Iterator[mcap_records.McapRecord]:
@@ -86,7 +86,7 @@ class Salvage:
             return
         size = record.end - record.body_at
         if record.opcode == Opcode.MESSAGE:
-            is_large = record.end - record.offset > self._max_chunk_bytes
+            is_large = record.end - record.offset > self._limit.max_bytes
         else:
             is_large = size > MAX_SECTION_BYTES
         if is_large:

@@ -19,6 +19,7 @@ from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Channel, Record, R
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     MAX_CHUNKS,
+    SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
     reading,
@@ -56,7 +57,7 @@ class McapWriter(BagWriter):
     """
 
     def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
-        self._max_chunk_mb = max_chunk_mb
+        self._limit = SizeLimit(max_chunk_mb << 20)
 
     def write(
         self,
@@ -96,7 +97,7 @@ class McapWriter(BagWriter):
         """Writes all that can be read of a file that was cut short into a whole file."""
         with _new_file(target) as stream:
             with reading(source), OpenFile(source) as file:
-                salvage = Salvage(file, self._max_chunk_mb << 20)
+                salvage = Salvage(file, self._limit)
                 copy = _Copy(stream, file.size)
                 for record in salvage.records():
                     copy.put(record)
@@ -122,7 +123,7 @@ class McapWriter(BagWriter):
                 if not is_finished(file):
                     raise UnreadableError("its writer did not finish it")
                 copy = _Copy(stream, file.size)
-                salvage = Salvage(file, self._max_chunk_mb << 20)
+                salvage = Salvage(file, self._limit)
                 left_out = _copy_without(leaves_out, salvage, copy)
                 count = sum(topic.count for topic in self._bags().summarize(source).topics)
                 if salvage.lost_bytes or count != copy.digest.messages + left_out.total():
@@ -132,7 +133,7 @@ class McapWriter(BagWriter):
         return left_out
 
     def _bags(self) -> McapBags:
-        return McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
+        return McapBags(1, self._limit)
 
     def _verify(self, target: Path, digest: ContentDigest) -> BagSummary:
         """Reads a new file back, compares it with what was to be written, returns its summary."""
@@ -141,7 +142,7 @@ class McapWriter(BagWriter):
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
         written = ContentDigest()
         with OpenFile(target) as file:
-            for record in Salvage(file, self._max_chunk_mb << 20).records():
+            for record in Salvage(file, self._limit).records():
                 written.add(record)
         if written.digests != digest.digests:
             raise UnreadableError("what was written is not what could be read")
