@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
-from ros2_memory.index.scan import BAG_DIR_SETTING, ScanResult, Stamp, Tree
+from ros2_memory.index.scan import BAG_DIR_SETTING, UNSEEN, ScanResult, Stamp, Tree
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -140,7 +140,7 @@ class BagTable:
         is_new = bool(changed) or self._timeline is not before
         is_new |= not scanned.is_like(self._scanned)
         # The first scan has a stamp for each file: too much to keep.
-        self._scanned = replace(scanned, stamps={}, before={}, gone=set())
+        self._scanned = replace(scanned, stamps={}, gone=set())
         return TableChange(removed, self._timeline.bags if is_first else added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
@@ -214,7 +214,8 @@ class BagTable:
         paths = {*new, *map(other_form, new), *scanned.gone} - self._files.keys()
         for bag in self._timeline.bags_named(paths):
             path = bag.file
-            before = scanned.before.get(path) or self._tree.stamp(path)
+            # A file that has changed is read again, whatever its stamp is.
+            before = UNSEEN if path in scanned.stamps else self._tree.stamp(path)
             notes = self._files[path] = FileNotes.first(path, before, context.now)
             notes.restore(bag.summary)
             classification = Classification(FileState.CLOSED, bag)

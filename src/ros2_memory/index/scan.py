@@ -85,7 +85,8 @@ def sidecar_ns_of(status: os.stat_result) -> Ns:
     return 0 if stat.S_ISLNK(status.st_mode) else limited(status.st_mtime_ns)
 
 
-_UNSEEN: Final = Stamp(-1, 0, 0, 0)
+UNSEEN: Final = Stamp(-1, 0, 0, 0)
+"""The stamp of a file that no scan has seen."""
 _ROW: Final = np.dtype([("size", "i8"), ("mtime", "i8"), ("ctime", "i8"), ("inode", "u8")])
 """A stamp without `sidecar_ns`, which all files of a directory share."""
 
@@ -97,7 +98,6 @@ class ScanResult:
     Attributes:
         stamps: by path, the bag files that are new, have changed, are watched, or may change
             without a trace.
-        before: by path, the previous stamps of these files, and of those that are gone.
         gone: paths of files that went since the last scan.
         damaged: directories that cannot be listed, and bag names that are no files; in no order.
         links: symbolic links; in no order.
@@ -107,7 +107,6 @@ class ScanResult:
     """
 
     stamps: dict[str, Stamp] = field(default_factory=dict)
-    before: dict[str, Stamp] = field(default_factory=dict)
     gone: set[str] = field(default_factory=set)
     damaged: list[SetAside] = field(default_factory=list)
     links: list[SetAside] = field(default_factory=list)
@@ -228,7 +227,7 @@ class _Folder:
             self.odd.append(SetAside(Path(entry.path), reason))
             # A known file is not gone because it cannot be looked up.
             self.trusted = False
-            stamps[entry.path] = before.get(entry.path, _UNSEEN)
+            stamps[entry.path] = before.get(entry.path, UNSEEN)
         else:
             stamps[entry.path] = Stamp.of(status, self.sidecar_ns)
             if status.st_nlink > 1:
@@ -288,9 +287,7 @@ class Tree:
             after = self._folders.get(path)
             if after is not folder:
                 there = {} if after is None else after.stamps
-                gone = {file: stamp for file, stamp in folder.stamps.items() if file not in there}
-                result.before.update(gone)
-                result.gone.update(gone)
+                result.gone.update(folder.stamps.keys() - there)
         self._look_up(watched, result)
         if patrolling:
             self._look_up(self._next_patrol(), result, settled_at=now)
@@ -342,7 +339,7 @@ class Tree:
     def stamp(self, path: str) -> Stamp:
         """Returns the stamp of a file that a scan returned."""
         folder = self._folders.get(_folder_of(path))
-        return _UNSEEN if folder is None else folder.stamps_of([path]).get(path, _UNSEEN)
+        return UNSEEN if folder is None else folder.stamps_of([path]).get(path, UNSEEN)
 
     def is_away(self, path: str) -> bool:
         """Returns whether the disk of a file has been unmounted."""
@@ -353,7 +350,7 @@ class Tree:
         """Makes the next scan report a file as new if it is there."""
         folder = self._folders.get(_folder_of(path))
         if folder is not None:
-            folder.newer[path] = _UNSEEN
+            folder.newer[path] = UNSEEN
             folder.trusted = False
 
     def _next_patrol(self) -> list[str]:
@@ -460,10 +457,10 @@ class Tree:
                     folder.add_entry(entry, stamps, before)
         folder.set_bags(stamps)
         for file, stamp in stamps.items():
-            known_stamp = before.get(file, _UNSEEN)
+            known_stamp = before.get(file, UNSEEN)
             is_looked_up = stamp is not known_stamp
             if is_looked_up and (stamp != known_stamp or not settled(stamp.mtime_ns, now)):
-                result.stamps[file], result.before[file] = stamp, known_stamp
+                result.stamps[file] = stamp
         return folder
 
     def _may_lead_to_bags(self, path: str) -> bool:
@@ -484,7 +481,7 @@ class Tree:
             stamps = {} if folder is None else folder.stamps_of(in_folder)
             for path in in_folder:
                 if path not in result.stamps and path not in result.gone:
-                    before = stamps.get(path, _UNSEEN)
+                    before = stamps.get(path, UNSEEN)
                     self._look_up_file(path, folder, before, result, settled_at)
 
     def _look_up_file(
@@ -500,14 +497,13 @@ class Tree:
         except OSError as error:
             if _is_gone(error):
                 result.gone.add(path)
-                result.before[path] = before
                 # The mtime of its folder may be the same, and the file may soon be back.
                 self.lose(path)
             elif folder is not None:
                 folder.trusted = False
             return
         if settled_at is None or stamp != before or not settled(stamp.mtime_ns, settled_at):
-            result.stamps[path], result.before[path] = stamp, before
+            result.stamps[path] = stamp
             if folder is not None and stamp != before:
                 folder.newer[path] = stamp
 
