@@ -63,8 +63,8 @@ def schemas_of(view: View, type_name: str) -> list[Schema]:
     if topic is None:
         return []
     schemas: list[Schema] = []
-    first, last = (find(topic, type_name) for find in (timeline.first_with, timeline.last_with))
-    for path in dict.fromkeys((first.path, last.path)):
+    bags = [timeline.bag_with(topic, type_name, last=last) for last in (False, True)]
+    for path in dict.fromkeys(bag.path for bag in bags):
         with suppress(BagError):
             channels = view.memory.reader.channels(path)
             schemas += [channel.schema for channel in channels if channel.type == type_name]

@@ -112,7 +112,7 @@ class ScanContext:
     open_recordings: frozenset[str] | None = None
     include_active: bool = False
     trusts_mtime: bool = True
-    _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
+    _listed: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     @property
     def settled_before(self) -> Ns:
@@ -132,12 +132,12 @@ class ScanContext:
         recording = path.parent.relative_to(self.root).as_posix()
         return self.open_recordings is not None and recording in self.open_recordings
 
-    def is_finished(self, path: Path) -> bool:
-        """Returns whether the metadata.yaml beside the file lists it."""
+    def lists(self, path: Path) -> bool:
+        """Returns whether the metadata.yaml beside a file lists it."""
         folder = path.parent
-        if folder not in self._finished:
-            self._finished[folder] = files_in_metadata(folder / "metadata.yaml")
-        return path.name in self._finished[folder]
+        if folder not in self._listed:
+            self._listed[folder] = files_in_metadata(folder / "metadata.yaml")
+        return path.name in self._listed[folder]
 
 
 @dataclass(slots=True)
@@ -280,7 +280,7 @@ def _is_active(notes: FileNotes, context: ScanContext) -> bool:
         and notes.kind in UNMARKED_KINDS
         and (context.open_recordings is None or context.names(notes.path))
         and notes.grew_lately(context)
-        and not context.is_finished(notes.path)
+        and not context.lists(notes.path)
     )
 
 

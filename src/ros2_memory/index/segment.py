@@ -251,8 +251,8 @@ class Segment:
         return tuple({id(alike.schema): alike.schema for alike in self.bags.summaries}.values())
 
     @cached_property
-    def _headers(self) -> tuple[TopicHeader, ...]:
-        """All topics; a topic with two types appears twice."""
+    def headers(self) -> tuple[TopicHeader, ...]:
+        """All topics; one with two types, or one that is latched at times, appears twice."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
 
     def _bags_with(self, attribute: str) -> Iterator[BagFile]:
@@ -264,7 +264,7 @@ class Segment:
         """By topic and type, the totals of all bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
         numbers = _sum_groups(self._by_folder, [0], axis=1)[:, 0].tolist()
-        for header, (messages, first, last) in zip(self._headers, numbers, strict=True):
+        for header, (messages, first, last) in zip(self.headers, numbers, strict=True):
             by_type = totals.setdefault(header.topic, {})
             known = by_type.get(header.type, NO_TOTALS)
             by_type[header.type] = known | TopicTotals(first, last, messages)
@@ -280,7 +280,7 @@ class Segment:
 
     def recordings(self, topic: str) -> dict[Path, TopicTotals]:
         """Returns the totals of a topic for each recording that holds it, over all types."""
-        headers = [nth for nth, header in enumerate(self._headers) if header.topic == topic]
+        headers = [nth for nth, header in enumerate(self.headers) if header.topic == topic]
         if not headers:
             return {}
         [by_folder] = _sum_groups(self._by_folder[headers], [0], axis=0).tolist()
@@ -296,7 +296,7 @@ class Segment:
         folders = self.bags.folder_of[self._order]
         order = np.argsort(folders, kind="stable")
         begins = np.searchsorted(folders[order], np.arange(len(self.bags.folders)))
-        return _sum_groups(self._numbers(self._headers)[:, order], begins, axis=1)
+        return _sum_groups(self._numbers(self.headers)[:, order], begins, axis=1)
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
@@ -322,7 +322,7 @@ class Segment:
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None if they do not have it."""
-        headers = [header for header in self._headers if header.topic == topic]
+        headers = [header for header in self.headers if header.topic == topic]
         if not headers:
             return None
         numbers = self._numbers(headers)[:, np.argsort(self._order)]
@@ -354,20 +354,9 @@ class Segment:
         return np.concatenate([alike.rows for alike in self.bags.summaries])
 
     @cached_property
-    def types(self) -> dict[str, frozenset[str]]:
-        """By topic, the types of its messages."""
-        types: dict[str, set[str]] = {}
-        for schema in self.schemas:
-            for header in schema.topics:
-                types.setdefault(header.topic, set()).add(header.type)
-        return {topic: frozenset(names) for topic, names in types.items()}
-
-    @cached_property
-    def transient_local(self) -> frozenset[str]:
-        """The topics that some publisher offered as transient local."""
-        return frozenset(
-            header.topic for schema in self.schemas for header in schema.topics if header.latched
-        )
+    def _topics(self) -> list[str]:
+        """All topics, sorted."""
+        return sorted({header.topic for header in self.headers})
 
     @cached_property
     def pacings(self) -> dict[str, Pacing]:
@@ -388,9 +377,8 @@ class Segment:
         counts = numbers[:, :, 0]
         spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
         rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
-        topics = sorted(self.types)
-        pacings = {topic: Pacing(*row) for topic, row in zip(topics, rows, strict=True)}
-        return pacings, dict(zip(topics, _runs(numbers), strict=True))
+        pacings = {topic: Pacing(*row) for topic, row in zip(self._topics, rows, strict=True)}
+        return pacings, dict(zip(self._topics, _runs(numbers), strict=True))
 
     def _parts_between_absences(self) -> tuple[Ints, Ints]:
         """Cuts bags at the absences that their summaries state.
@@ -401,7 +389,7 @@ class Segment:
         """
         numbers = self._numbers_by_topic()
         lengths = (numbers[:, :, 0] > 0) @ (self.bags.ends - self.bags.starts)[self._order]
-        row_of = {topic: row for row, topic in enumerate(sorted(self.types))}
+        row_of = {topic: row for row, topic in enumerate(self._topics)}
         later_parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
         has_absences = self.bags.with_schema(attrgetter("absences"))[self._order]
         for column in np.flatnonzero(has_absences).tolist():
@@ -425,12 +413,12 @@ class Segment:
 
         The bags are in the order of `_order`.
         """
-        headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
+        headers = sorted(self.headers, key=attrgetter("topic"))
         numbers = self._numbers(headers)
-        if len(headers) == len(topics):
+        if len(headers) == len(self._topics):
             return numbers
         names = [header.topic for header in headers]
-        return _sum_groups(numbers, [*map(names.index, topics)], axis=0)
+        return _sum_groups(numbers, [*map(names.index, self._topics)], axis=0)
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:

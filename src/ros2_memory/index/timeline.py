@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.bag_summary import TopicHeader
 
 MAX_FILE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """The longest time that a file is taken to hold if only one end of it is known."""
@@ -220,12 +221,15 @@ class Timeline:
         return sum(map(int, closed))
 
     @cached_property
+    def _headers(self) -> frozenset[TopicHeader]:
+        return frozenset(chain.from_iterable(segment.headers for segment in self.segments))
+
+    @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
         """By topic (sorted), the types of its messages (sorted)."""
         types: dict[str, set[str]] = {}
-        for segment in self.segments:
-            for topic, names in segment.types.items():
-                types.setdefault(topic, set()).update(names)
+        for header in self._headers:
+            types.setdefault(header.topic, set()).add(header.type)
         return {topic: tuple(sorted(types[topic])) for topic in sorted(types)}
 
     @cached_property
@@ -234,7 +238,7 @@ class Timeline:
 
         A subscriber may receive their last messages again, long after they were published.
         """
-        return frozenset(chain.from_iterable(segment.transient_local for segment in self.segments))
+        return frozenset(header.topic for header in self._headers if header.latched)
 
     def topics(self) -> tuple[str, ...]:
         """Returns the topics with a message in some bag, sorted."""
@@ -324,28 +328,16 @@ class Timeline:
             if span is not None and window.overlaps(*span):
                 yield from segment.extents(topic, window)
 
-    def first_with(self, topic: str, type_name: str) -> BagFile:
-        """Returns the first bag that holds the topic under a type; there must be one."""
-        return next(self._bags_with(topic, type_name, self.segments, nth=0))
+    def bag_with(self, topic: str, type_name: str, *, last: bool = False) -> BagFile:
+        """Returns the first or last bag that holds the topic under a type; there must be one."""
 
-    def last_with(self, topic: str, type_name: str) -> BagFile:
-        """Returns the last bag that holds the topic under a type; there must be one."""
-        return next(self._bags_with(topic, type_name, reversed(self.segments), nth=-1))
+        def are_held(headers: Iterable[TopicHeader]) -> bool:
+            return any((header.topic, header.type) == (topic, type_name) for header in headers)
 
-    @staticmethod
-    def _bags_with(
-        topic: str, type_name: str, segments: Iterable[Segment], *, nth: int
-    ) -> Iterator[BagFile]:
-        """Yields of each segment that has any the first or last bag with the topic under a type."""
-        for segment in segments:
-            if type_name in segment.types.get(topic, ()):
-                holds_topic = segment.bags.with_schema(
-                    lambda schema: any(
-                        (header.topic, header.type) == (topic, type_name)
-                        for header in schema.topics
-                    )
-                )
-                yield segment.bags[int(holds_topic.nonzero()[0][nth])]
+        segments = self.segments[::-1] if last else self.segments
+        segment = next(segment for segment in segments if are_held(segment.headers))
+        rows = np.flatnonzero(segment.bags.with_schema(lambda schema: are_held(schema.topics)))
+        return segment.bags[int(rows[-1 if last else 0])]
 
 
 def _end_of_faults(bag: BagFile) -> Ns:

@@ -286,7 +286,7 @@ def missing_data(view: View) -> Iterator[str]:
 
 def _has_times_alone(view: View, topic: str) -> bool:
     """Returns whether the first bag of a topic lacks its payloads: in a lake the oldest bags do."""
-    first = (view.timeline.first_with(topic, name) for name in view.timeline.types_of(topic))
+    first = (view.timeline.bag_with(topic, name) for name in view.timeline.types_of(topic))
     with suppress(BagError):  # it was deleted just now
         return any(topic in view.memory.reader.times_alone(bag.path) for bag in first)
     return False
@@ -401,7 +401,7 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
-    bag = view.timeline.first_with(topic, type_name)
+    bag = view.timeline.bag_with(topic, type_name)
     stored = view.memory.scanner.channels(view.timeline, bag)
     reasons = {*_reasons_of(view, stored, topic, type_name)}
     # Other bags are stored, too, also deleted ones: if they differ in this, the bag itself is read.
