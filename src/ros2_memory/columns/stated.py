@@ -44,7 +44,7 @@ from ros2_memory.core.text import dotted
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.table import Table, Texts
     from ros2_memory.core.arrays import Floats
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
@@ -94,6 +94,27 @@ class StatedColumns:
         except UnknownShapeError:
             return None
         return FromColumns(Stated(table.log_times, facts), unsure)
+
+
+class StatusNames:
+    """Reads the names of the statuses in diagnostics; remembers where a type has them.
+
+    Args:
+        extractor: has the schema map.
+    """
+
+    def __init__(self, extractor: SchemaExtractor) -> None:
+        self._leaves = ByType(extractor, lambda shape: _entry_leaves(shape.value, shape.type).name)
+
+    def of(self, table: Table) -> tuple[IntArray, Texts] | None:
+        """Returns the row of each status, ascending, and its name; None without such columns."""
+        leaf = self._leaves.of(table)
+        if leaf is None or leaf.level.parent is not ROWS:
+            return None
+        try:
+            return Values(table).elements(leaf.level).owners, Values(table).texts(leaf)
+        except UnknownShapeError:
+            return None
 
 
 Reader: TypeAlias = "Callable[[Values], tuple[Facts, IntArray]]"

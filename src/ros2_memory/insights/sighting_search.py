@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.facts import DIAGNOSTICS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.arrays import stable_order, stacked
+from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
@@ -121,13 +122,21 @@ class _TopicRuns:
             if not self._is_open:
                 self._begins = MAX_NS
                 return
-        tested = block.tested()
+        self.add_messages(block.tested())
+
+    def add_messages(self, tested: Tested) -> None:
+        """Adds the next older messages."""
         if tested.times.size:
             # One by one, many small blocks take long.
             self._waiting.append(tested)
             self._messages += tested.times.size
             if self._messages >= _MOST_WAITING:
                 self._join()
+
+    def is_open(self) -> bool:
+        """Returns whether the oldest run may go on in an older block."""
+        self._join()
+        return self._is_open
 
     def _join(self) -> None:
         """Joins the matches of the blocks that wait to the runs, which are newer."""
@@ -179,6 +188,50 @@ class _TopicRuns:
             self._is_open, self._begins = False, MAX_NS
 
 
+class _DiagnosticRuns:
+    """Joins the blocks of a topic of diagnostics, the newest first, into the runs of each node.
+
+    A message says nothing of what other nodes report.
+
+    Args:
+        topic: its number.
+    """
+
+    def __init__(self, topic: int) -> None:
+        self._topic = topic
+        self._nodes: dict[int, _TopicRuns] = {}
+        # Blocks without a match after the oldest one that was added, the newest first.
+        self._without_match: list[Block] = []
+
+    def tables(self, *, cut: bool) -> list[Ints]:
+        """Returns tables of runs; see `_TopicRuns.tables`."""
+        return [table for node in self._nodes.values() for table in node.tables(cut=cut)]
+
+    def add(self, block: Block) -> None:
+        """Adds the next older block."""
+        if not block.has_match and not any(node.is_open() for node in self._nodes.values()):
+            self._without_match.append(block)
+            return
+        # They end the runs of this block if their messages follow soon enough.
+        for newer in self._without_match:
+            if newer.first - block.last <= SILENCE_NS:
+                self._add_messages(newer.tested())
+        self._without_match = []
+        self._add_messages(block.tested())
+
+    def _add_messages(self, tested: Tested) -> None:
+        for node in np.unique(tested.nodes).tolist():
+            runs = self._nodes.get(node)
+            if runs is None:
+                runs = self._nodes[node] = _TopicRuns(self._topic, apart=False, breaks=None)
+            runs.add_messages(rows_of(tested, tested.nodes == node))
+
+    def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
+        """Ends the oldest runs if the topic has a message in a time that is not searched."""
+        for node in self._nodes.values():
+            node.end_in(view, topic, gap)
+
+
 def find_runs(
     view: View, search: ReverseSearch, scope: Scope, *, enough: int | None
 ) -> SearchedRuns:
@@ -205,8 +258,10 @@ def find_runs(
     latched = [topic for topic in breaks if scope.is_bounded]
     if latched:
         enough = None
-    by_topic = {
-        topic: _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
+    by_topic: dict[str, _TopicRuns | _DiagnosticRuns] = {
+        topic: _DiagnosticRuns(nth)
+        if DIAGNOSTICS in view.timeline.types_of(topic)
+        else _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
         for nth, topic in enumerate(topics)
     }
     windows = [scope.window] if latched else scope.narrowed()
@@ -238,7 +293,7 @@ def _blocks_newest_first(
     search: ReverseSearch,
     scope: Scope,
     windows: Iterable[TimeWindow],
-    by_topic: Mapping[str, _TopicRuns],
+    by_topic: Mapping[str, _TopicRuns | _DiagnosticRuns],
 ) -> Iterator[Block]:
     """Yields the blocks of all topics in windows, the newest first; ends runs between windows."""
     searched = scope.window.stop
@@ -299,14 +354,16 @@ def _in_scope(block: Block, scope: Scope) -> Block:
     return block._replace(tested=test)
 
 
-def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:
+def _has_enough(
+    by_topic: Collection[_TopicRuns | _DiagnosticRuns], enough: int, reached: Ns
+) -> bool:
     """Returns whether the newest runs are known, whatever matches before a moment (ns) follow."""
     runs = _newest_first(by_topic, cut=True)
     newest = runs[:enough]
     return len(runs) > enough and newest[-1, _LAST] >= reached and bool(newest[:, _BEGUN].all())
 
 
-def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool) -> Ints:
+def _newest_first(by_topic: Collection[_TopicRuns | _DiagnosticRuns], *, cut: bool) -> Ints:
     """Returns the runs of all topics in one table; see `_TopicRuns.tables`."""
     tables = [table for topic_runs in by_topic for table in topic_runs.tables(cut=cut)]
     return _in_order(np.concatenate([np.empty((0, len(Run._fields)), np.int64), *tables]))

@@ -3,7 +3,8 @@
 A sighting is a run of consecutive messages of one topic that meet a condition. It ends with a
 message that does not, and, unless the topic is latched, where it is silent for longer than
 `SILENCE_NS`: a detector may publish only what it sees. A message that cannot be decoded is neither
-a match nor an end. In a topic of statuses each goal is a sighting, in a log each message.
+a match nor an end. In a topic of statuses each goal is a sighting, in a log each message. In one of
+diagnostics each node has sightings of its own.
 """
 
 from __future__ import annotations

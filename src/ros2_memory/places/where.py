@@ -35,6 +35,7 @@ from ros2_memory.history.held_values import deletions, ends_of_holding, held_tim
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
+from ros2_memory.history.tested_messages import MET, UNKNOWN, Tested, met_by_any
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
     MapPlacement,
@@ -520,7 +521,8 @@ class _ConditionStates:
         tested = stacked(parts)
         order = np.lexsort((tested.sources, tested.times))
         rows = order[tested.met[order] != UNKNOWN]
-        return tested.times[rows].tolist(), (tested.met[rows] == MET).tolist()
+        met = tested.met[rows] == MET
+        return tested.times[rows].tolist(), met_by_any(met, tested.nodes[rows]).tolist()
 
 
 def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:

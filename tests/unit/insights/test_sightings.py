@@ -42,7 +42,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import asked, each_way, memory_of, remembered, with_store
 from tests.support.tables import table
 
 S = 10**9
@@ -308,6 +308,46 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     for more in ({}, {"field": "status.level"}):
         assert newest("/diagnostics", "WARN", **more)["timestamp"] == T0 + 5
     assert newest("/rosout", "OK", field="status.level")["error"] == "invalid_arguments"
+
+
+@each_way
+@pytest.mark.parametrize("split_s", [7.0, 1000.0])
+def test_diagnostics_of_one_node_go_on_while_others_report(
+    tmp_path: Path, split_s: float, *, recalls: bool
+) -> None:
+    def report(second: float, **levels: tuple[int, str]) -> Msg:
+        return diagnostics(BEGIN + round(second * S), **levels)
+
+    reported: list[Msg] = []
+    for second in range(60):
+        door = (2, "blocked") if 20 <= second < 40 else (0, "ok")
+        reported += [
+            report(second, door=door, lamp=(0, "ok")),
+            report(second + 0.5, lidar=(1, "dusty") if 30 <= second < 50 else (0, "ok")),
+            report(second + 0.75, motor=(0, "ok")),
+        ]
+    write_splits(tmp_path, reported, split_s)
+    memory = memory_of(tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
+    ask = partial(asked, memory, topic="/diagnostics")
+
+    def sightings(kind: str, **how: object) -> list[tuple[float, float, int]]:
+        found = ask("find_matches", condition_type=kind, **how)
+        return [
+            (each["first_seen"] - T0, each["duration_s"], each["count"])
+            for each in found["sightings"]
+        ]
+
+    assert sightings("contains", value="blocked") == [(20.0, 20.0, 20)]
+    worse = {"field": "status.level", "value": 0}
+    assert sightings("above", **worse) == [(30.5, 20.0, 20), (20.0, 20.0, 20)]
+    [[_, _, _, times, seconds, *_]] = ask(
+        "find_matches", condition_type="above", **worse, by="day"
+    )["rows"]
+    assert (times, seconds) == (2, 30.5)
+    dusty = {"topic": "/diagnostics", "condition_type": "contains", "value": "dusty"}
+    motor = sightings("contains", value="motor", **{"while": dusty})
+    assert motor == [(30.75, 19.75, 20)]
 
 
 def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_are_left_out(
