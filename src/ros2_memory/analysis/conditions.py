@@ -233,19 +233,24 @@ Test: TypeAlias = Contains | Equals | Beyond | NearPosition
 class Condition:
     """A test, and the dot-path of the part of the value that it is applied to (None: all of it).
 
-    If `min_score` is above 0, detections of a lower score do not count.
+    If `min_score` is above 0, detections of a lower score do not count. `tests_by_type` has the
+    tests of types that give a constant another number.
     """
 
     test: Test
     field: str | None = None
     min_score: float = 0.0
+    tests_by_type: tuple[tuple[str, Test], ...] = ()
 
     def of_type(self, type_name: str, extractor: SchemaExtractor) -> Condition:
         """Returns the condition for a type, whose extracted values may have a shorter field."""
         if self.field is None:
             return self
         path = extractor.own_path(self.field, type_name)
-        return self if path == self.field else replace(self, field=path)
+        test = dict(self.tests_by_type).get(type_name, self.test)
+        if path == self.field and test is self.test:
+            return self
+        return replace(self, test=test, field=path, tests_by_type=())
 
     def is_unstated(self, value: JsonValue) -> bool:
         """Returns whether a value names elements (joints), but not the one that is asked for."""

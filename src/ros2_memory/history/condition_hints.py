@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.conditions import Condition, NearPosition
@@ -19,13 +20,19 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
+_INTEGER: Final = r"(?:u?int[0-9]+|byte|char|octet|(?:unsigned[ \t]+)?(?:short|long))"
 _CONSTANT: Final = re.compile(
-    r"^[ \t]*(?:u?int[0-9]+|byte|char)[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\s*(?:#|$)",
+    rf"^[ \t]*(?:const[ \t]+)?{_INTEGER}[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)"
+    r"\s*(?:[#;]|$)",
     re.MULTILINE,
 )
-"""A constant that is a whole number, in the text of a message definition, as ROS 2 writes it."""
+"""A constant that is a whole number, in the text of a message definition, or in IDL."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
-_NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
+_NUMBER_FIELD: Final = rf"^[ \t]*(?:{_INTEGER}|float[0-9]*|double)[ \t]+{{}}\b"
+_SEPARATOR: Final = re.compile(r"^={40,}[ \t]*$", re.MULTILINE)
+"""A line between the definitions of a type and of its parts."""
+_MOST_CONSTANTS: Final = 16
+"""How many constants a refusal lists."""
 _MOST_FRAMES: Final = 3
 """The frames of this many topics are named: each reads one message."""
 
@@ -33,24 +40,45 @@ _MOST_FRAMES: Final = 3
 def constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
     """Returns the number of a constant if the value is its name and the field a number.
 
-    Else returns the value.
+    Constants of the part that has the field come first. Else returns the value.
     """
-    word = value.strip() if isinstance(value, str) else ""
+    word = value.strip().upper() if isinstance(value, str) else ""
     if not _CONSTANT_NAME.fullmatch(word):
         return value
     shown, _, below = field.partition(".")
     path = below or ".".join(view.extractor.fields_of(type_name).get(shown, (shown,)))
+    schemas = schemas_of(view, type_name)
+    for constants in (
+        chain.from_iterable(_constants_beside(schema, path) for schema in schemas),
+        chain.from_iterable(_constants_of(schema, path) for schema in schemas),
+    ):
+        numbers = {number for constant, number in constants if constant == word}
+        if numbers:
+            return int(numbers.pop()) if len(numbers) == 1 else value
+    return value
+
+
+def _constants_of(schema: Schema, path: str) -> list[tuple[str, str]]:
+    """Returns all constants of a definition, if a dot-path leads to a number in it."""
+    text = _text_of(schema)
+    return _CONSTANT.findall(text) if _has_number(text, path) else []
+
+
+def _constants_beside(schema: Schema, path: str) -> list[tuple[str, str]]:
+    """Returns the constants of the parts of a definition that have the number at a dot-path."""
+    parts = [part for part in _SEPARATOR.split(_text_of(schema)) if _has_number(part, path)]
+    return [constant for part in parts for constant in _CONSTANT.findall(part)]
+
+
+def _has_number(text: str, path: str) -> bool:
     _, _, name = path.rpartition(".")
-    number_field = re.compile(_NUMBER_FIELD.format(re.escape(name)), re.MULTILINE)
-    texts = [_text_of(schema) for schema in schemas_of(view, type_name)]
-    numbers = {
-        number
-        for text in texts
-        if number_field.search(text)
-        for constant, number in _CONSTANT.findall(text)
-        if constant == word
-    }
-    return int(numbers.pop()) if len(numbers) == 1 else value
+    return re.search(_NUMBER_FIELD.format(re.escape(name)), text, re.MULTILINE) is not None
+
+
+def constants_listed(schema: Schema, field: str) -> str:
+    """Returns the constants beside a field that is a number, with their values; empty if none."""
+    constants = dict.fromkeys(_constants_beside(schema, field))
+    return listed([f"{name} = {number}" for name, number in constants], at_most=_MOST_CONSTANTS)
 
 
 def schemas_of(view: View, type_name: str) -> list[Schema]:

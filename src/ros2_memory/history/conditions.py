@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from contextlib import suppress
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -49,8 +50,8 @@ class Sought(NamedTuple):
 def condition_of(view: View, sought: Sought) -> Condition:
     """Returns the condition of a question.
 
-    If all topics have one type, the value may be the name of a level (WARN) of a log or status, or
-    of a constant of the message definition if the field is a number.
+    The value may be the name of a constant of the message definition if the field is a number; if
+    all topics have one type, also that of a level (WARN) of a log or status.
 
     Raises:
         NoDataError: no such topic is recorded.
@@ -66,7 +67,12 @@ def condition_of(view: View, sought: Sought) -> Condition:
     if field and type_name:
         field = view.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
-        value = constant_number(view, value, field, type_name)
+    numbers = {}
+    if field:
+        field = field.strip()
+        numbers = {name: constant_number(view, value, field, name) for name in sorted(types)}
+    if len({*map(repr, numbers.values())}) == 1:
+        [value, *_] = numbers.values()
     try:
         condition = parse_condition(
             condition_type, value, limits.position_tolerance_m, field, least
@@ -75,7 +81,12 @@ def condition_of(view: View, sought: Sought) -> Condition:
         hint = unknown_name_hint(value, field, types)
         raise InvalidArgumentsError(f"{error}{hint}") from error
     _require_fraction(view, pattern, condition)
-    return condition
+    named = [
+        (name, parse_condition(condition_type, number, limits.position_tolerance_m, field).test)
+        for name, number in numbers.items()
+        if number != value
+    ]
+    return replace(condition, tests_by_type=tuple(named))
 
 
 def types_matching(view: View, pattern: str) -> frozenset[str]:

@@ -24,7 +24,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, Un
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.condition_hints import constants_named, require_frame
+from ros2_memory.history.condition_hints import constants_listed, constants_named, require_frame
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.held_values import is_text
@@ -420,9 +420,11 @@ class ReverseSearch:
         if refusal is None or word is None:
             return refusal
         _, _, name = field.rpartition(".")
-        constants = constants_named(newest.record.channel.schema, name, word)
+        schema = newest.record.channel.schema
+        constants = constants_named(schema, name, word)
         if not constants:
-            return refusal
+            known = constants_listed(schema, field)
+            return f"{refusal}, or one of {known}" if known else refusal
         # Without a field, the number would also match in the bytes of an id.
         advice = "" if field else ": ask equals on the field of that number"
         return f"{refusal}, such as {listed(constants)}{advice}"

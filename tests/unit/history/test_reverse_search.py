@@ -302,6 +302,56 @@ def test_never_of_a_word_names_the_constant_that_has_it(
             last(memory, kind, word, "/winch", field="state")
 
 
+def test_a_constant_stands_for_the_number_that_each_type_of_a_topic_gives_it(
+    tmp_path: Path,
+) -> None:
+    """As after an update of the robot; the older type is defined in IDL."""
+    idl = (
+        f"{'=' * 80}\nIDL: old_msgs/msg/Winch\n"
+        "module old_msgs { module msg {\n  module Winch_Constants {\n"
+        "    const uint8 STATE_IDLE = 1;\n    const uint8 STATE_HAULING = 4;\n"
+        "    const uint8 STATE_BROKEN = 5;\n  };\n"
+        "  struct Winch {\n    @default (value=0)\n    uint8 state;\n  };\n}; };\n"
+    )
+
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema("old_msgs/msg/Winch", "ros2idl", idl.encode())
+        channel = writer.register_channel("/winch", "cdr", schema)
+        for nth, state in enumerate([1, 4, 4, 2, 5]):
+            at = T0 + nth * NS_PER_S
+            writer.add_message(channel, at, bytes([0, 1, 0, 0, state]), at)
+
+    raw_mcap(tmp_path / "old" / "old_0.mcap", fill)
+    states = [
+        Msg(
+            "/winch",
+            "winch_msgs/msg/Winch",
+            T0 + (100 + nth) * NS_PER_S,
+            make("winch_msgs/msg/Winch", state=state, cable=1.0, note=""),
+        )
+        for nth, state in enumerate([0, 2, 2, 4])
+    ]
+    write_mcap(tmp_path / "new" / "new_0.mcap", states)
+    memory = memory_of(tmp_path)
+
+    def times(value: str) -> list[float]:
+        found = asked(
+            memory,
+            "find_matches",
+            topic="/winch",
+            condition_type="equals",
+            field="state",
+            value=value,
+        )
+        return [row["first_seen"] - T0_S for row in found["sightings"]]
+
+    assert times("STATE_HAULING") == times("state_hauling") == [101, 1]
+    assert times("STATE_BROKEN") == [4]
+    named = r"must be a number, or one of STATE_IDLE = 0, STATE_HAULING = 2$"
+    with pytest.raises(InvalidArgumentsError, match=named):
+        last(memory, "equals", "STATE_PAYING", "/winch", field="state")
+
+
 def test_a_constant_is_refused_without_the_field_of_its_number(tmp_path: Path) -> None:
     """Its number may also be a byte of an id."""
     memory = remembered(tmp_path, [goals(T0, {6: 4})])
