@@ -844,11 +844,11 @@ def trajectory_summary(
         elapsed.skipped_between(path.first, path.last),
         shown.totals.gap_ns,
         away,
-        notes=(*view.notes.sentences(), *_path_notes(shown)),
+        notes=(*view.notes.sentences(), *_path_notes(shown, view.limits.max_plausible_speed_mps)),
     )
 
 
-def _path_notes(path: Trajectory) -> Iterator[str]:
+def _path_notes(path: Trajectory, plausible_mps: float) -> Iterator[str]:
     """Yields what a path leaves out, and how it was measured."""
     yield from length_notes(path)
     jumps = [point for point in path.waypoints if point.jump]
@@ -859,6 +859,12 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
             f"of the jumps {longest} to a waypoint with jump: true; that distance was not driven"
         )
     mean, fastest = path.avg_speed, path.max_speed
+    is_stated = path.max_speed_from == "twist"
+    if path.totals.jumps and is_stated and fastest is not None and fastest > plausible_mps:
+        yield (
+            f"the messages state up to {fastest:.1f} m/s, and steps faster than {plausible_mps:g} "
+            "m/s (data.max_plausible_speed_mps) are taken for jumps: set it higher"
+        )
     if path.poses and fastest is not None and path.max_speed_from == "positions":
         yield "max_speed is measured from positions: the messages have no speed"
     if mean is not None and fastest is not None and mean > fastest + _ROUNDING_MPS:

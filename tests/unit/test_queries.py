@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import command, detections, odom
 from tests.support.closed_form import TURN_RATE, position
@@ -96,3 +96,22 @@ def test_a_recorded_circle_is_answered_in_its_closed_form(
     steps = round((end - begin) * 20)
     assert driven.totals.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
     assert driven.max_speed == pytest.approx(SPEED, abs=1e-6)
+
+
+def test_a_robot_that_is_faster_than_is_taken_for_plausible_is_told_the_setting(
+    tmp_path: Path,
+) -> None:
+    """As on a road: each of its steps would be a jump, and its path have no metres."""
+    driven = [odom(T0 + nth * S // 5, x=nth * 2.8, vx=14.0) for nth in range(100)]
+    memory = remembered(tmp_path, driven)
+    reply = asked(memory, "trajectory_summary", start=T0 // S, end=T0 // S + 20)
+    advice = (
+        "the messages state up to 14.0 m/s, and steps faster than 10 m/s "
+        "(data.max_plausible_speed_mps) are taken for jumps: set it higher"
+    )
+    assert advice in reply["notes"]
+    limits = QuerySettings(max_plausible_speed_mps=20.0)
+    memory = memory_of(tmp_path, limits=limits)
+    reply = asked(memory, "trajectory_summary", start=T0 // S, end=T0 // S + 20)
+    assert reply["distance_m"] == pytest.approx(99 * 2.8, rel=0.01)
+    assert "plausible" not in str(reply.get("notes"))
