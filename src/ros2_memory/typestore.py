@@ -384,6 +384,11 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
                 Field(field_name, defined(kind) if "/" in kind else kind, length)
                 for field_name, kind, length in shapes
             ),
+            tuple(
+                (constant, value)
+                for constant, _, value in definitions[name][0]
+                if type(value) is int  # a boolean names no number
+            ),
         )
 
     return defined(root)

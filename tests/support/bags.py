@@ -3,9 +3,9 @@
 import math
 import os
 import sqlite3
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 
@@ -77,6 +77,20 @@ OTHER_ROBOTS = {
     "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",
     "radar_msgs/msg/RadarScan": "std_msgs/Header header\nRadarReturn[] returns\n",
+    "autoware_perception_msgs/msg/ObjectClassification": (
+        "uint8 UNKNOWN = 0\nuint8 CAR = 1\nuint8 TRUCK = 2\nuint8 PEDESTRIAN = 7\n"
+        "uint8 label\nfloat32 probability\n"
+    ),
+    "autoware_perception_msgs/msg/TrackedObjectKinematics": (
+        "geometry_msgs/PoseWithCovariance pose_with_covariance\n"
+    ),
+    "autoware_perception_msgs/msg/TrackedObject": (
+        "unique_identifier_msgs/UUID object_id\nfloat32 existence_probability\n"
+        "ObjectClassification[] classification\nTrackedObjectKinematics kinematics\n"
+    ),
+    "autoware_perception_msgs/msg/TrackedObjects": (
+        "std_msgs/Header header\nTrackedObject[] objects\n"
+    ),
     "mavros_msgs/msg/StatusText": "uint8 WARNING = 4\nuint8 severity\nstring text\n",
     "nav2_msgs/msg/BehaviorTreeStatusChange": (
         "builtin_interfaces/Time timestamp\nstring node_name\nuint16 uid\n"
@@ -415,6 +429,42 @@ def diagnostics(ns: int, **levels: tuple[int, str]) -> Msg:
     ]
     body = make("diagnostic_msgs/msg/DiagnosticArray", header=header(ns, ""), status=statuses)
     return Msg("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ns, body)
+
+
+def tracked(
+    ns: int, objects: Sequence[tuple[Mapping[int, float], float, float]], frame_id: str = "map"
+) -> Msg:
+    """TrackedObjects of Autoware: the probability of each class, x and y of each object."""
+    package = "autoware_perception_msgs/msg"
+    point = partial(make, "geometry_msgs/msg/Point", z=0.0)
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    body = make(
+        f"{package}/TrackedObjects",
+        header=header(ns, frame_id),
+        objects=[
+            make(
+                f"{package}/TrackedObject",
+                object_id=make("unique_identifier_msgs/msg/UUID", uuid=np.zeros(16, np.uint8)),
+                existence_probability=0.9,
+                classification=[
+                    make(f"{package}/ObjectClassification", label=label, probability=probability)
+                    for label, probability in classes.items()
+                ],
+                kinematics=make(
+                    f"{package}/TrackedObjectKinematics",
+                    pose_with_covariance=make(
+                        "geometry_msgs/msg/PoseWithCovariance",
+                        pose=make(
+                            "geometry_msgs/msg/Pose", position=point(x=x, y=y), orientation=turn
+                        ),
+                        covariance=np.zeros(36),
+                    ),
+                ),
+            )
+            for classes, x, y in objects
+        ],
+    )
+    return Msg("/perception/objects", f"{package}/TrackedObjects", ns, body)
 
 
 def goals(ns: int, statuses: Mapping[int, int]) -> Msg:

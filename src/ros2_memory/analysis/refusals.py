@@ -147,9 +147,13 @@ def fields_of_constant(constant: str, value: JsonValue) -> list[str]:
         name = path.rpartition(".")[2]
         words = (name, name.rpartition("_")[2])
         begins = any(constant.lower().startswith(f"{word}_") for word in words)
-        if begins and any(type(leaf) is int for leaf in at_field(value, path)):
+        if begins and any(map(_is_whole_number, at_field(value, path))):
             fields.append(path)
     return fields
+
+
+def _is_whole_number(value: JsonValue) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _is_array(value: JsonValue) -> bool:

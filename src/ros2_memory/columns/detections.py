@@ -47,6 +47,7 @@ from ros2_memory.messages.detections import (
     Detection,
     detections_of,
     has_more_content,
+    hypotheses_field,
     naming_fields,
 )
 
@@ -82,10 +83,12 @@ class NamedScores(NamedTuple):
 
 
 def _names(values: Values, leaf: Leaf) -> Texts:
-    """Returns the texts of a leaf, or its whole numbers as texts."""
+    """Returns the texts of a leaf, or the names of its whole numbers, else these as texts."""
     if leaf.kind is Kind.TEXT:
         return values.texts(leaf)
-    return Texts.of([*map(str, values.numbers(leaf).values.tolist())])
+    names: Mapping[float, str] = dict(leaf.names)
+    numbers = values.numbers(leaf).values.tolist()
+    return Texts.of([names.get(number) or str(number) for number in numbers])
 
 
 def _texts_or(texts: Texts, fallback: Texts, *, replace_blank: bool = False) -> Texts:
@@ -316,10 +319,10 @@ def _labels(
 ) -> Labels | None:
     """Returns how an object with these fields may be a detection; None if it never is."""
     named, points, is_best = fields, _points(fields), False
-    results = fields.get("results")
+    field = hypotheses_field(fields)
+    results = None if field is None else fields[field]
     element = results.element if isinstance(results, Listing) else None
     if isinstance(element, dict) and not _naming_leaves(fields):
-        # The hypotheses of a detection (vision_msgs).
         is_best, hypothesis, of_best = True, element.get("hypothesis"), _points(element)
         named = hypothesis if isinstance(hypothesis, dict) else element
         points = None if of_best is None or points is None else of_best + points
@@ -346,8 +349,8 @@ def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> 
 
     limit = Limit(labels.level_of_objects, find_objects)
     if labels.is_best:
-        results = with_limit(node["results"], Limit(labels.level, find_hypotheses))
-        node = {**node, "results": results}
+        field = hypotheses_field(node) or ""
+        node = {**node, field: with_limit(node[field], Limit(labels.level, find_hypotheses))}
     return with_limit(node, limit)
 
 

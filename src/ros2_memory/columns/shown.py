@@ -47,6 +47,7 @@ from ros2_memory.messages.conversions import (
     Summary,
     ValueKind,
     kind_of_type,
+    label_names,
     names_beside,
     own_path,
 )
@@ -230,6 +231,10 @@ class Shape:
         if kind is ValueKind.QUATERNION:
             return _angles_of(level, sources) if are_numbers else NOTHING
         nodes = {name: self._node(field) for name, field in fields.items()}
+        for name, names in label_names(nodes, definition.constants).items():
+            leaf = nodes[name]
+            if isinstance(leaf, Leaf) and leaf.kind is Kind.INTEGER:
+                nodes[name] = leaf._replace(names=tuple(names.items()))
         summarized = SUMMARIZED.get(definition.type)
         if summarized in fields:
             nodes[summarized] = _summary(definition.type, nodes, fields[summarized])

@@ -109,6 +109,7 @@ class Leaf(NamedTuple):
         json_depth: how deep detections of a low score are looked for in a text that may be JSON; 0
             for not at all.
         limits: which rows or elements have it in the extracted value.
+        names: of a number that is a label, the constants that name its values.
     """
 
     level: Level
@@ -117,6 +118,7 @@ class Leaf(NamedTuple):
     conversion: Conversion = Conversion.STORED
     json_depth: int = 0
     limits: tuple[Limit, ...] = ()
+    names: tuple[tuple[int, str], ...] = ()
 
     @property
     def is_number(self) -> bool:

@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals, at_field, plain_text
+from ros2_memory.analysis.facts import DIAGNOSTICS
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
+from ros2_memory.columns.stated import StatusNames
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import TruthValues, nowhere
-from ros2_memory.core.arrays import rows_of, stacked
+from ros2_memory.core.arrays import places_among, rows_of, stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, listed
@@ -70,11 +72,13 @@ class Tested:
         times: log times (ns).
         met: `MET`, `NOT_MET` or `UNKNOWN` for each message.
         sources: the number of each message's recording and type, which orders equal log times.
+        nodes: of diagnostics, on whose topic many nodes publish, a number for each node; else 0.
     """
 
     times: IntArray
     met: NDArray[np.uint8]
     sources: IntArray
+    nodes: IntArray
 
 
 class Block(NamedTuple):
@@ -299,6 +303,8 @@ class ReverseSearch:
         require_frame(view, self.topics, condition)
         self.ruled_out = False
         self._test = RowCondition(view, condition)
+        self._status_names = StatusNames(view.extractor)
+        self._nodes: dict[str, int] = {}
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
@@ -489,11 +495,32 @@ class ReverseSearch:
             for nth, message in messages_at(self._view, rows.some(neighbours)):
                 is_match = self.matches(message)
                 met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
-        tested = Tested(rows.times, met, np.full(len(rows), source))
+        tested = Tested(rows.times, met, np.full(len(rows), source), self._nodes_of(rows))
         if topic in self._view.moving_topics and plain_text(self.condition.test):
             # A message of transforms that does not name a frame says nothing of it.
             return rows_of(tested, met == MET)
         return tested
+
+    def _nodes_of(self, rows: Rows) -> IntArray:
+        """Returns a number for the node of each row: for the first status that it names."""
+        nodes = np.zeros(len(rows), np.int64)
+        if rows.table.channel.type != DIAGNOSTICS:
+            return nodes
+        parts: Iterable[tuple[IntArray, Rows]] = [(np.arange(len(rows)), rows)]
+        if self._status_names.of(rows.table) is None:
+            parts = decoded_rows(self._view, rows)
+        for positions, part in parts:
+            named = self._status_names.of(part.table)
+            if named is None:
+                continue
+            owners, names = named
+            has_any, firsts = np.unique(owners, return_index=True)
+            index = np.arange(len(part.table)) if part.index is None else part.index
+            places, is_among = places_among(has_any, index)
+            numbers = [self._nodes.setdefault(name, len(self._nodes) + 1) for name in names.words]
+            firsts_among = names.codes[firsts[is_among]]
+            nodes[positions[places[is_among]]] = np.array(numbers, np.int64)[firsts_among]
+        return nodes
 
     def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns a number for each recording and type of a topic, in the order of `Rows.order`."""
@@ -532,6 +559,20 @@ class ReverseSearch:
             if newest >= since:
                 kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
                 self._view.notes.add_lack(Note(kind, f"{topic} ({type_name})"))
+
+
+def met_by_any(met: Mask, nodes: IntArray) -> Mask:
+    """Returns for each message, in order, whether the newest one of some node meets a condition.
+
+    What a node said before its first message is taken to be what that says.
+    """
+    order = np.argsort(nodes, kind="stable")
+    is_met = met[order].astype(np.int64)
+    is_first = np.diff(nodes[order], prepend=-1) != 0
+    changes = np.empty_like(is_met)
+    changes[order] = np.where(is_first, 0, np.diff(is_met, prepend=0))
+    met_by: Mask = is_met[is_first].sum() + np.cumsum(changes) > 0
+    return met_by
 
 
 def _merged_and_split(waiting: Block, following: Block) -> tuple[Block | None, Block]:

@@ -11,15 +11,17 @@ import dataclasses
 import keyword
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from enum import Enum, auto
-from functools import lru_cache
+from functools import lru_cache, partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.core import geometry
+from ros2_memory.core.text import LABELS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -92,14 +94,20 @@ def layout_of_class(cls: type) -> Layout | None:
     type_name = str(getattr(cls, "__msgtype__", ""))
     summaries = _SUMMARIES.get(type_name, {})
     fields: dict[str, MessageField] = {}
+    constants: list[tuple[str, int]] = []
     for field in dataclasses.fields(cls):
         # rosbags imports ClassVar for type checkers only, so that dataclasses takes the constants
         # of a definition for fields; the annotation's text still distinguishes them.
         is_constant = isinstance(field.type, str) and field.type.startswith("ClassVar")
-        if not is_constant and field.name != "structure_needs_at_least_one_member":
+        if is_constant:
+            if type(field.default) is int:
+                constants.append((field.name, field.default))
+        elif field.name != "structure_needs_at_least_one_member":
             bare = field.name.removesuffix("_")  # which rosbags appends to Python's keywords
             name = bare if keyword.iskeyword(bare) else field.name
             fields[name] = MessageField(field.name, summaries.get(name))
+    for name, names in label_names(fields, constants).items():
+        fields[name] = fields[name]._replace(summarize=partial(_with_name, names))
     return Layout(fields, kind_of_type(type_name, [*fields]))
 
 
@@ -273,6 +281,51 @@ def view(node: object, name: str) -> object:
         return Metric(value) if isinstance(value, float) else value
     summarize = fields[name].summarize if name in fields else None
     return value if summarize is None or value is ABSENT else summarize(node, value)
+
+
+class NamedNumber(int):
+    """A whole number that is a label, and whose type has a constant for it.
+
+    Attributes:
+        name: of the constant.
+    """
+
+    name: str
+
+    @classmethod
+    def of(cls, number: int, name: str) -> NamedNumber:
+        """Returns a number with its name."""
+        named = cls(number)
+        named.name = name
+        return named
+
+
+def label_names(
+    fields: Iterable[str], constants: Sequence[tuple[str, int]]
+) -> Mapping[str, Mapping[int, str]]:
+    """Returns the names of the numbers of each field that has a label, by the type's constants.
+
+    Where constants begin with the name of the field (`LABEL_CAR`), these count alone, without it. A
+    number of several constants has no name.
+    """
+    named: dict[str, Mapping[int, str]] = {}
+    for field in fields if constants else ():
+        if field not in LABELS:
+            continue
+        prefix = f"{field.upper()}_"
+        own = [
+            (name[len(prefix) :], number) for name, number in constants if name.startswith(prefix)
+        ]
+        counts = Counter(number for _, number in own or constants)
+        named[field] = {number: name for name, number in own or constants if counts[number] == 1}
+    return named
+
+
+def _with_name(names: Mapping[int, str], _message: object, value: object) -> object:
+    """Returns a whole number with its name, if it has one."""
+    if not isinstance(value, int) or value not in names:
+        return value
+    return NamedNumber.of(value, names[value])
 
 
 class Summary(dict[str, V]):

@@ -2,7 +2,8 @@
 
 - A detection is an object with a name under one of `naming_fields`: an entry of a list, or the
   whole message. A list of strings under one of `LISTS_OF_LABELS` is a list of detections.
-- A detection of vision_msgs is named by its best hypothesis.
+- An object without a name, but with a list of hypotheses under one of `HYPOTHESES`, is a detection
+  that is named by the best of them.
 - A string that is JSON is parsed. An object in it is a detection if it is in a list, has a score, a
   place or an outline, or nothing beside its name, nor the message beside the string: else it is a
   state, or the object of a command.
@@ -21,7 +22,7 @@ from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, looks_like_json
-from ros2_memory.messages.conversions import number, triple, xyz
+from ros2_memory.messages.conversions import NamedNumber, number, triple, xyz
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
 
 SCORES: Final = ("score", "confidence", "probability")
+HYPOTHESES: Final = ("results", "classification")
+"""Lists of what an object may be, in vision_msgs and in autoware_perception_msgs."""
 NOT_LABELLED: Final = frozenset({"stride"})
 """An object with such a field is a std_msgs/MultiArrayDimension, whose label names an axis."""
 
@@ -42,6 +45,9 @@ POSITIONS: Final = (
     ("pose",),
     ("bbox", "center", "position"),
     ("bbox3d", "center", "position"),
+    ("kinematics", "pose", "position"),
+    ("kinematics", "pose_with_covariance", "pose", "position"),
+    ("kinematics", "initial_pose_with_covariance", "pose", "position"),
     (),  # x, y and z of the object itself
 )
 _SCORED: Final = frozenset(SCORES)
@@ -182,13 +188,14 @@ class _Walk:
         return remaining
 
     def _visit_parts(self, value: JsonObject, frame: str, depth: int, inside: _Inside) -> JsonValue:
-        """Visits an object without a name: a detection of vision_msgs, or one with them inside."""
-        best = _best_result(value.get("results"))
+        """Visits an object without a name: one with hypotheses, or with detections inside."""
+        field = hypotheses_field(value)
+        best = None if field is None else _best_result(value[field])
         best_label = None if best is None else _label(_hypothesis(best))
-        if best is not None and best_label is not None:
+        if field is not None and best is not None and best_label is not None:
             score = _score(_hypothesis(best))
             self.detections.append(_detection_at((best, value), frame, best_label, score))
-            return self._without_low_hypotheses(value, best)
+            return self._without_low_hypotheses(value, field, best)
         fields: JsonObject = {}
         for name, part in value.items():
             if name in LISTS_OF_LABELS and isinstance(part, list):
@@ -201,22 +208,27 @@ class _Walk:
             fields[name] = part if is_leaf else self.visit(part, frame, depth - 1, within)
         return value if all(map(is_, fields.values(), value.values())) else fields
 
-    def _without_low_hypotheses(self, value: JsonObject, best: JsonObject) -> JsonValue:
-        """Returns a detection of vision_msgs without its low hypotheses; None if `best` is low."""
+    def _without_low_hypotheses(self, value: JsonObject, field: str, best: JsonObject) -> JsonValue:
+        """Returns a detection without the low hypotheses in a field; None if `best` is low."""
         if self._is_low(_hypothesis(best)):
             return None
-        results = value["results"]
+        results = value[field]
         remaining: list[JsonValue] = []
         for result in results if isinstance(results, list) else ():
             is_low = isinstance(result, dict) and self._is_low(_hypothesis(result))
             remaining.append(None if is_low else result)
-        return {**value, "results": remaining} if None in remaining else value
+        return {**value, field: remaining} if None in remaining else value
 
     def _is_low(self, value: JsonObject) -> bool:
         if self._min_score is None:
             return False
         score = _score(value)
         return score is not None and score < self._min_score
+
+
+def hypotheses_field(fields: Collection[str]) -> str | None:
+    """Returns which of the fields of an object has its hypotheses; None if none has."""
+    return next((name for name in HYPOTHESES if name in fields), None)
 
 
 def has_more_content(fields: Collection[str]) -> bool:
@@ -238,13 +250,14 @@ def _label(value: JsonObject) -> str | None:
         label = value.get(name)
         if isinstance(label, str) and label.strip():
             return label
-        if type(label) is int and first_number is None:  # a boolean is no number
-            first_number = str(label)
+        is_number = isinstance(label, int) and not isinstance(label, bool)
+        if is_number and first_number is None:
+            first_number = label.name if isinstance(label, NamedNumber) else str(label)
     return first_number
 
 
 def _best_result(results: JsonValue) -> JsonObject | None:
-    """Returns the first result of vision_msgs with the highest score; None without results."""
+    """Returns the first hypothesis with the highest score; None without hypotheses."""
     best: JsonObject | None = None
     best_score = -math.inf
     for result in results if isinstance(results, list) else ():

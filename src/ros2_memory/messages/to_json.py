@@ -21,6 +21,7 @@ from ros2_memory.messages.conversions import (
     Degrees,
     Layout,
     Metric,
+    NamedNumber,
     Summary,
     ValueKind,
     euler,
@@ -140,7 +141,7 @@ class ExactJson:
         if node is None or node is ABSENT or isinstance(node, bool):
             return node if isinstance(node, bool) else None
         if isinstance(node, _REALS):
-            return self._number(node)
+            return node if type(node) is NamedNumber else self._number(node)
         if depth >= MAX_DEPTH:
             note = f"{_named(path)}: parts deeper than {MAX_DEPTH} levels are left out"
             self.note("depth", path, note)

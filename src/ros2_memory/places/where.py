@@ -32,10 +32,9 @@ from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
-from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested
+from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested, met_by_any
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
-from ros2_memory.history.tested_messages import MET, UNKNOWN, Tested, met_by_any
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
     MapPlacement,

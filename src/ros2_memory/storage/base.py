@@ -163,10 +163,14 @@ class Definition:
 
     Equal nested types are one object: a definition of a few lines can nest so deep that its
     spelled-out fields would not fit into memory.
+
+    Attributes:
+        constants: the whole numbers that the type itself names.
     """
 
     type: str
     fields: tuple[Field, ...]
+    constants: tuple[tuple[str, int], ...] = ()
 
     def text(self) -> str:
         """Returns the definition as rosbag2 writes it: `.msg` files, one after the other.

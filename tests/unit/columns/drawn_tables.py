@@ -74,6 +74,13 @@ UNMAPPED = {
         "int32 class_id\nstring id\nfloat32 score\ngeometry_msgs/PoseStamped pose\n"
     ),
     "own_msgs/msg/PosedArray": "std_msgs/Header header\nPosed[] objects\n",
+    # As in autoware_perception_msgs.
+    "own_msgs/msg/Class": (
+        "uint8 UNKNOWN=0\nuint8 CAR=1\nuint8 HAZARD=2\nuint8 label\nfloat32 probability\n"
+    ),
+    "own_msgs/msg/Motion": "geometry_msgs/PoseWithCovariance pose_with_covariance\n",
+    "own_msgs/msg/Tracked": "Class[] classification\nMotion kinematics\n",
+    "own_msgs/msg/TrackedArray": "std_msgs/Header header\nTracked[] objects\n",
 }
 MAPPED = (
     "nav_msgs/msg/Odometry",
@@ -105,6 +112,7 @@ OTHERS = (
     "own_msgs/msg/Nested",
     "own_msgs/msg/Label",
     "own_msgs/msg/PosedArray",
+    "own_msgs/msg/TrackedArray",
     "aruco_opencv_msgs/msg/ArucoDetection",
     "sensor_msgs/msg/MagneticField",
     "nav_msgs/msg/OccupancyGrid",

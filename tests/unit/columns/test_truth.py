@@ -152,6 +152,7 @@ DETECTING = (
     "vision_msgs/msg/Detection3DArray",
     "own_msgs/msg/Label",
     "own_msgs/msg/PosedArray",
+    "own_msgs/msg/TrackedArray",
     "aruco_opencv_msgs/msg/ArucoDetection",
 )
 STATING = (

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
+from ros2_memory.messages.conversions import NamedNumber, label_names
 from ros2_memory.messages.detections import (
+    HYPOTHESES,
     MAX_DEPTH,
     Detection,
     detections_of,
@@ -45,6 +47,25 @@ STAMPED: JsonValue = {"header": {"frame_id": "map"}, "pose": AT}
         # JSON of ultralytics, and with a flat place
         ({"name": "cup", "class": 41, "confidence": 0.5, "pose": FLAT}, CUP),
         ({"category": "cup", "confidence": 0.5, **FLAT}, CUP),
+        # autoware_perception_msgs: the likeliest of several classes, and a place in the kinematics
+        (
+            {
+                "object_id": {"uuid": [1, 2]},
+                "classification": [
+                    {"label": 6, "probability": 0.25},
+                    {"label": 7, "probability": 0.5},
+                ],
+                "kinematics": {"initial_pose_with_covariance": {"pose": AT}},
+            },
+            CUP._replace(label="7"),
+        ),
+        (
+            {
+                "classification": [{"label": 6, "probability": 0.5}],
+                "kinematics": {"pose_with_covariance": {"pose": AT}},
+            },
+            CUP._replace(label="6"),
+        ),
         # Without a label: isaac_ros_apriltag_interfaces, aruco_opencv_msgs, darknet_ros_msgs
         (
             {"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}},
@@ -199,9 +220,22 @@ def test_detections_of_a_low_score_leave_their_places_empty() -> None:
     assert without_low_scores({"class": "cup", "score": 0.4}, 0.5) is None
 
 
+def test_constants_of_its_type_name_the_numbers_of_a_label() -> None:
+    classes = [("CAR", 1), ("TRUCK", 2), ("LORRY", 2)]
+    assert label_names(["label", "size"], classes) == {"label": {1: "CAR"}}
+    own = [("SHAPE_BOX", 0), ("LABEL_CAR", 0), ("LABEL_TRUCK", 1)]
+    assert label_names(["label"], own) == {"label": {0: "CAR", 1: "TRUCK"}}
+    assert label_names(["mode"], own) == {}
+    assert detections_of([{"label": NamedNumber.of(1, "CAR")}]) == (Detection("CAR"),)
+
+
 _scores = st.none() | st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, math.nan])
 _named = st.fixed_dictionaries({"label": st.sampled_from(["cup", "fork"]), "score": _scores})
-_several = st.builds(lambda parts: {"results": [*parts]}, st.lists(_named, max_size=3))
+_several = st.builds(
+    lambda name, parts: {name: [*parts]},
+    st.sampled_from(HYPOTHESES),
+    st.lists(_named, max_size=3),
+)
 _seen = st.recursive(
     _named | _several | json_values,
     lambda inner: (

@@ -29,7 +29,18 @@ from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import estimation, known, places, synonyms, unseen
 from ros2_memory.things.find import find_things
 from ros2_memory.things.places import places_of
-from tests.support.bags import Msg, detected, header, make, odom, text, tf, transform, write_splits
+from tests.support.bags import (
+    Msg,
+    detected,
+    header,
+    make,
+    odom,
+    text,
+    tf,
+    tracked,
+    transform,
+    write_splits,
+)
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
 
@@ -426,6 +437,32 @@ def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[See
         assert all("not_seen_where_expected" in state for state in since.values())
     if seen and seen[0][:2] == ("coffee mug", 3.1):
         assert since["mug"] == {"seen_since": last}
+
+
+@each_way
+def test_tracked_objects_are_things_of_their_likeliest_class_by_its_name(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    messages = looked(0, 20, HERE)
+    for second in range(20):
+        car, walker = ({1: 0.75, 2: 0.25}, 4.0, 1.0), ({0: 0.25, 7: 0.5}, 3.0, -1.0)
+        seen = [car, ({9: 0.5}, 2.0, 2.0), *([walker] if 5 <= second < 15 else [])]
+        messages.append(tracked((BEGIN + second) * S, seen))
+    write_splits(tmp_path, messages)
+    memory = memory_of(tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
+    found = asked(memory, "find_things")
+    assert found["labels"] == {"pedestrian": 1, "car": 1, "9": 1}
+    [car_thing] = asked(memory, "find_things", label="car")["things"]
+    assert (car_thing["place"]["x"], car_thing["place"]["y"]) == (4.0, 1.0)
+    texts = [
+        event["text"] for event in asked(memory, "recap", start=BEGIN, end=BEGIN + 30)["events"]
+    ]
+    assert [text for text in texts if "PEDESTRIAN" in text] == ["PEDESTRIAN in view"]
+    assert not [text for text in texts if "TRUCK" in text or "UNKNOWN" in text]
+    ask_labels = {"topic": "/perception/objects", "condition_type": "contains", "by": "label"}
+    rows = asked(memory, "find_matches", **ask_labels, value="")["rows"]
+    assert [row[:3] for row in rows] == [["9", 1, 19.0], ["CAR", 1, 19.0], ["PEDESTRIAN", 1, 9.0]]
 
 
 def test_two_of_a_kind_one_above_the_other_are_two_though_no_message_has_both(
