@@ -65,6 +65,8 @@ _LEAD_NS: Final = 30 * NS_PER_S
 """How long before a window messages are read: a change shows by the message before it."""
 _OLDEST_STATE_NS: Final = 3600 * NS_PER_S
 """How old a state may be that no later message repeats. The state of a latched topic never ages."""
+_RECEIVED_NS: Final = 3 * NS_PER_S
+"""How long after a run of the recorder began it may receive latched messages of before."""
 _AROUND_NS: Final = 600 * NS_PER_S
 """A topic with messages so near is recorded, even if it has nothing to report."""
 _POSE_NS: Final = 2 * NS_PER_S
@@ -188,7 +190,7 @@ def changes_in(view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents
             of_topic = _commanded_stops(view, command, events_of_topics)
         else:
             of_topic = _changes_of_topic(topic, events)
-        firsts = _firsts_of_runs(view, topic, window)
+        firsts = firsts_of_runs(view, topic, window)
         changes += (change for change in of_topic if change.first not in firsts)
     return ChangesBefore(
         changes,
@@ -213,16 +215,21 @@ def _commanded_stops(
             yield _DatedChange(at, at, f"{command} went to zero while a goal was active")
 
 
-def _firsts_of_runs(view: View, topic: str, window: TimeWindow) -> frozenset[Ns]:
+def firsts_of_runs(view: View, topic: str, window: TimeWindow) -> frozenset[Ns]:
     """Returns the log times of a topic's first messages in runs of the recorder.
 
-    What such a message states may be so for long. None of a log, nor of a latched topic.
+    What such a message states may be so for long. None of a log. Of a latched topic those alone
+    that the recorder received as it began: they were published before.
     """
-    if view.timeline.is_log(topic) or _holds_over_runs(view, topic):
+    if view.timeline.is_log(topic):
         return frozenset()
+    begun = np.array([stop for _, stop in view.snapshot.breaks], np.int64)
     firsts = np.sort(view.bounds(topic, window.widened(_OLDEST_STATE_NS))[0])
-    nth = np.searchsorted(firsts, [stop for _, stop in view.snapshot.breaks])
-    return frozenset(firsts[nth[nth < firsts.size]].tolist())
+    nth = np.searchsorted(firsts, begun)
+    begun, firsts = begun[nth < firsts.size], firsts[nth[nth < firsts.size]]
+    if _holds_over_runs(view, topic):
+        firsts = firsts[firsts - begun <= _RECEIVED_NS]
+    return frozenset(firsts.tolist())
 
 
 def _holds_over_runs(view: View, topic: str) -> bool:

@@ -42,6 +42,7 @@ from ros2_memory.insights.changes_before import (
     SLACK_NS,
     ChangesBefore,
     changes_in,
+    firsts_of_runs,
     recap_before,
 )
 from ros2_memory.insights.drive import Drive, drive_in
@@ -375,7 +376,11 @@ def _reported_events(
     for topic, topic_events in events_of_topics.items():
         toggles = _toggles(view, topic, topic_events)
         if toggles:
-            events += _flip_events(topic, toggles, _ends_of_holding(view, topic, window))
+            # What is received as the recorder begins became so before.
+            is_held = is_latched(view, topic)
+            firsts = firsts_of_runs(view, topic, window) if is_held else frozenset()
+            flips = _flip_events(topic, toggles, _ends_of_holding(view, topic, window))
+            events += (flip for flip in flips if flip.start not in firsts)
         errors = _errors_in_region(view, topic, topic_events, region_stays)
         events += [_error_event(error) for error in errors]
         events += _low_charge_events(view, topic, topic_events)

@@ -429,6 +429,32 @@ def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_
     assert told(before(memory, 7203.0)) == [("/docked became false", 3.0)]
 
 
+@each_way
+def test_what_a_latched_topic_said_as_the_recorder_began_did_not_change_then(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """The recorder receives the newest value, however old it is."""
+    layout = McapLayout(latched=frozenset({"/docked"}))
+    for start, said in ((0, {0.5: True}), (600, {600.5: False, 630: True})):
+        beats = [odom(at(start + nth)) for nth in range(60)]
+        docked = [boolean(at(t), value, "/docked") for t, value in said.items()]
+        path = tmp_path / f"rec{start}" / f"rec{start}_0.mcap"
+        write_mcap(path, sorted([*beats, *docked], key=attrgetter("log_time")), layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    for start in (0, 600):
+        events = asked(memory, "recap", start=T0 + start, end=T0 + 659)["events"]
+        docked_events = [
+            (event["timestamp"] - T0, event["text"])
+            for event in events
+            if "/docked" in event["text"]
+        ]
+        assert docked_events == [(630.0, "/docked became true")]
+        *_, stop = (event for event in events if event["text"].startswith("stood at"))
+        assert "before" not in stop
+    reply = before(memory, 605.0)
+    assert (told(reply), reply["state"]) == ([], {"/docked": False})
+
+
 TOPIC = "/drive/_action/status"
 
 
