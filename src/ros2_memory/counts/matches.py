@@ -34,6 +34,7 @@ from ros2_memory.core.text import Quoted, counted, listed, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
 from ros2_memory.counts.labels import BY_LABEL, count_labels, read_labels
+from ros2_memory.history.condition_hints import names_of_numbers
 from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
@@ -454,6 +455,7 @@ def count_values(
         view.notes.add_lack(f"only what is after {unix_text(start)} is counted: {error}")
     if not held_values:
         raise no_data_between(view, (topic,), asked)
+    view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held_values}))
     outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
     named_rows = _value_rows(held_values, view.elapsed_in(asked), united(outside), condition)
     if len(named_rows) > _MOST_VALUES:

@@ -13,7 +13,7 @@ from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
@@ -73,6 +73,20 @@ def _constants_beside(schema: Schema, path: str) -> list[tuple[str, str]]:
 def _has_number(text: str, path: str) -> bool:
     _, _, name = path.rpartition(".")
     return re.search(_NUMBER_FIELD.format(re.escape(name)), text, re.MULTILINE) is not None
+
+
+def names_of_numbers(
+    view: View, topic: str, field: str | None, numbers: Collection[str]
+) -> Iterator[str]:
+    """Yields for each type of a topic a sentence with the constants of some numbers in a field."""
+    for type_name in view.timeline.types_of(topic):
+        constants = chain.from_iterable(
+            _constants_beside(schema, field or "") for schema in schemas_of(view, type_name)
+        )
+        named = [f"{name} = {number}" for name, number in dict.fromkeys(constants)]
+        named = [name for name in named if name.rpartition(" ")[2] in numbers]
+        if named:
+            yield f"numbers of {type_name}: {listed(named, at_most=_MOST_CONSTANTS)}"
 
 
 def constants_listed(schema: Schema, field: str) -> str:

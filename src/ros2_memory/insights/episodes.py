@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.history.condition_hints import names_of_numbers
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
 from ros2_memory.history.held_values import HeldValue, HeldValues, holds_on, is_latched, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
@@ -261,6 +262,7 @@ def topic_changes(
         )
     if not held:
         raise no_data_between(view, (topic,), window)
+    view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held}))
     elapsed = view.elapsed_in(window)
     spells = [
         replace(spell_of(value), skipped=elapsed.skipped_between(value.start, value.stop))

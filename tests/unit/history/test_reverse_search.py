@@ -347,6 +347,13 @@ def test_a_constant_stands_for_the_number_that_each_type_of_a_topic_gives_it(
 
     assert times("STATE_HAULING") == times("state_hauling") == [101, 1]
     assert times("STATE_BROKEN") == [4]
+    window = {"topic": "/winch", "start": T0_S, "end": T0_S + 200, "fields": ["state"]}
+    for how in ({"changes": True}, {"by": "value"}):
+        notes = asked(memory, "get_topic_in_range", **window, **how)["notes"]
+        assert [note for note in notes if note.startswith("numbers of ")] == [
+            "numbers of old_msgs/msg/Winch: STATE_IDLE = 1, STATE_HAULING = 4, STATE_BROKEN = 5",
+            "numbers of winch_msgs/msg/Winch: STATE_IDLE = 0, STATE_HAULING = 2",
+        ]
     named = r"must be a number, or one of STATE_IDLE = 0, STATE_HAULING = 2$"
     with pytest.raises(InvalidArgumentsError, match=named):
         last(memory, "equals", "STATE_PAYING", "/winch", field="state")
