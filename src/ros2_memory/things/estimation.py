@@ -271,7 +271,8 @@ def _link(group: LabelGroup, observed: Observations) -> list[Instance]:
     """Links the stays of a label into as few things as explain them.
 
     A thing goes on to its next stay after one that was seen to end, without the thing at its place.
-    Once a label is known to be moved, a thing may also have left a place that nobody looked at.
+    Once a label is known to be moved, a thing may also have left a place that nobody looked at, but
+    not all of several that stand there.
     """
     instances = _chain_stays(group, group.stays, proven=True)
     if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
@@ -295,7 +296,10 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
             instance
             for instance in instances
             if instance.stays[-1].firm_last <= stay.firm_first
-            and (not proven or _has_ended(instance.stays[-1], stay))
+            and (
+                _has_ended(instance.stays[-1], stay)
+                or not (proven or instance.stays[-1].side_by_side > stay.side_by_side)
+            )
         ]
         if not ended:
             instances.append(Instance(group.key, group.epoch, [stay]))

@@ -47,6 +47,7 @@ class PlacedStay:
         first, last: log times of the detections (ns); `firm_first` and `firm_last` are those of
             the detections beyond doubt.
         count: how many detections.
+        side_by_side: how many things of the label stand there, by most of the stay.
         misread_as: how often it was seen under the labels of other things.
     """
 
@@ -63,6 +64,7 @@ class PlacedStay:
     firm_first: Ns
     firm_last: Ns
     count: int
+    side_by_side: int
     misread_as: Counter[str] = field(default_factory=Counter)
 
     @property

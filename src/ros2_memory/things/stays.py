@@ -24,6 +24,7 @@ from ros2_memory.core.arrays import (
     numbered,
     range_numbers,
     rows_by,
+    run_starts,
     stable_order,
 )
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
@@ -130,7 +131,8 @@ def placed_stays(
     firm_first = np.minimum.reduceat(np.where(is_firm, first, MAX_NS), begins)
     firm_last = np.maximum.reduceat(np.where(is_firm, last, -MAX_NS), begins)
     first, last = np.minimum.reduceat(first, begins), np.maximum.reduceat(last, begins)
-    columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count)
+    beside = _side_by_side(spots, stay_of)
+    columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count, beside)
     placed = []
     numbers = zip(*(column.tolist() for column in columns), strict=True)
     for stay, own_rows, row in zip(stays, np.split(rows, begins[1:]), numbers, strict=True):
@@ -138,6 +140,21 @@ def placed_stays(
         is_weak = stay.clear_hits < FEWEST or stay.hits < _LOWEST_RATE * stay.messages
         placed.append(PlacedStay(own_rows, stay, left, is_weak, *row))
     return placed
+
+
+def _side_by_side(spots: Ints, stay_of: Ints) -> Ints:
+    """Returns how many things stand side by side in the middle one of each stay's slices.
+
+    Spots are in the order of their stays and slices. Two of one message are never one thing.
+    """
+    begins = run_starts(stay_of, spots[:, Spot.SLICE])
+    together = np.maximum.reduceat(spots[:, Spot.TOGETHER], begins)
+    numbers = np.minimum(np.diff(begins, append=len(spots)), together)
+    stays = stay_of[begins]
+    numbers = numbers[np.lexsort((numbers, stays))]
+    sizes = np.bincount(stays)
+    middle: Ints = numbers[np.cumsum(sizes) - sizes + sizes // 2]
+    return middle
 
 
 def end_where_carried_away(group: LabelGroup, observed: Observations) -> None:

@@ -881,6 +881,21 @@ def test_a_thing_that_the_robot_took_along_is_one_though_nobody_looked_back(tmp_
     assert cup["moved"][0]["place"]["x"] == pytest.approx(1.9, abs=0.05)
 
 
+def test_two_that_stand_together_did_not_both_become_the_one_that_is_seen_elsewhere(
+    tmp_path: Path,
+) -> None:
+    """Cups are known to be moved. Behind the robot it sees one, and has not looked back since."""
+    messages = looked(0, 30, HERE, ("cup", 3.0, -1.5))
+    messages += looked(40, 70, HERE, ("cup", 3.0, 0.97), ("cup", 3.0, 1.03))
+    messages += looked(80, 110, AWAY, ("cup", -2.0, 0.0))
+    found = told_of(tmp_path, messages, label="cup")
+    behind, two = found["things"]
+    assert (behind["place"]["x"], two["place"]["x"]) == pytest.approx((-2.0, 3.0), abs=0.05)
+    assert two["at_once"] == 2
+    assert "not_looked_at_since" in two["still_there"]
+    assert found["labels"] == {"cup": 3}
+
+
 def test_two_labels_that_stand_apart_are_two_things_though_no_message_has_both(
     tmp_path: Path,
 ) -> None:
