@@ -65,6 +65,11 @@ if TYPE_CHECKING:
 MAX_SHOWN_CHARS: Final = 20_000
 """A longer value would fill a reply alone, and is thinned harder."""
 
+NOWHERE: Final[Vector3] = (math.nan,) * 3
+"""The position (m) of a null pose."""
+AT_ORIGIN_M: Final = 0.000_05
+"""A coordinate up to this is 0 in the store."""
+
 _LISTED_NAMES: Final = 40
 _TURNS: Final = ("orientation", "rotation")
 """Fields in which a quaternion is shown as angles."""
@@ -101,13 +106,20 @@ class PointPose:
     arrays: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
-        """Returns position (m) and rotation in a message; None if it has no position."""
+        """Returns position (m) and rotation in a message; None if it has no position.
+
+        A null pose, as of a camera's odometry that lost track, is at `NOWHERE`.
+        """
         point_node, turn_node = self.position.of(message), self.orientation.of(message)
         position, turn = xyz(point_node), rotation(turn_node)
         if self.arrays:
             position = triple(point_node) if position is None else position
             turn = _px4_rotation(turn_node) if turn is None else turn
-        return None if position is None else (position, turn)
+        if position is None:
+            return None
+        return (
+            (NOWHERE, None) if turn is None and _is_null(position, turn_node) else (position, turn)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -520,6 +532,12 @@ def _poses(
         heading = next((name for name in _HEADINGS if name in names), "heading")
         return (PlanarPose(route("x"), route("y"), route("z"), route(heading)),)
     return ()
+
+
+def _is_null(position: Vector3, turn_node: object) -> bool:
+    """Returns whether a pose without a rotation is null: all its numbers are zero."""
+    turn = xyzw(turn_node) or quadruple(turn_node)
+    return turn is not None and not any(turn) and max(map(abs, position)) <= AT_ORIGIN_M
 
 
 def _px4_rotation(node: object) -> Quaternion | None:

@@ -136,6 +136,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 _NOT_A_NUMBER: Final = "the recorded position is not a number"
+_NO_PLACE: Final = "the recorded pose is no place: NaN, or all zeros, as where tracking is lost"
 
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
@@ -415,8 +416,8 @@ def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | N
     """Returns the pose in a message in `frame_id`, with the named place; notes tell its flaws."""
     recording = stored.bag.recording
     if not all(map(math.isfinite, pose.position)):
-        view.notes.add(_NOT_A_NUMBER)
-    if pose.orientation is None:
+        view.notes.add(_NO_PLACE)
+    elif pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
     if is_thinned(stored.bag.file):
         _note_reach(view, stored, pose)

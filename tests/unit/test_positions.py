@@ -458,6 +458,40 @@ def test_positions_that_are_no_numbers_are_not_said_to_be_missing(tmp_path: Path
         assert refused["detail"].endswith("has a valid position")
 
 
+def slam_pose(ns: int, x: float, turn: object) -> Msg:
+    pose = make("geometry_msgs/msg/Pose", position=point(x, 0.0), orientation=turn)
+    body = make("geometry_msgs/msg/PoseStamped", header=header(ns, "map"), pose=pose)
+    return Msg("/slam/pose", "geometry_msgs/msg/PoseStamped", ns, body, ns)
+
+
+NO_TURN = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
+
+
+@each_way
+def test_a_null_pose_of_lost_tracking_is_no_position(tmp_path: Path, recalls: bool) -> None:
+    def told(n: int) -> Msg:
+        is_lost = 20 <= n < 40
+        place, turn = (0.0, NO_TURN) if is_lost else (5.0 + 0.1 * n, quaternion(0.0))
+        return slam_pose(T0 + n * S, place, turn)
+
+    memory = remembered(tmp_path, [*map(told, range(60))], recalls=recalls)
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 30)
+    assert (reply["x"], reply["y"], reply["yaw_deg"]) == (None, None, None)
+    assert "all zeros, as where tracking is lost" in str(reply["notes"])
+    assert asked(memory, "visits", x=0.0, y=0.0, radius_m=1.0)["total"] == 0
+    path = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 60)
+    assert (path["poses"], path["gap_m"]) == (40, pytest.approx(2.1))
+
+
+@each_way
+def test_a_position_without_a_rotation_is_one(tmp_path: Path, recalls: bool) -> None:
+    beacon = [slam_pose(T0 + n * S, 0.1 * n, NO_TURN) for n in range(1, 9)]
+    memory = remembered(tmp_path, [odom(T0, 0.0), *beacon], recalls=recalls)
+    assert asked(memory, "get_position_at", timestamp=T0_S)["x"] == 0.0
+    reply = asked(memory, "get_position_at", timestamp=T0_S + 5, topic="/slam/pose")
+    assert (reply["x"], reply["yaw_deg"]) == (0.5, None)
+
+
 def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
     messages = [
         tf(

@@ -17,10 +17,12 @@ from ros2_memory.columns.pack import EXACT, METRES, QUATERNION, RADIANS, VELOCIT
 from ros2_memory.columns.shown import ByType, Listing, Node, Shape, xyzw_of
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError
-from ros2_memory.core.arrays import Floats, Vectors, row_sums
+from ros2_memory.core.arrays import Flags, Floats, Vectors, row_maxima, row_sums
 from ros2_memory.extract import (
+    AT_ORIGIN_M,
     FRAME,
     FRAMES_OF_TYPES,
+    NOWHERE,
     POSE_FRAMES,
     UNMAPPED,
     Plan,
@@ -253,6 +255,7 @@ def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:
     positions = np.zeros((times.size, 3))
     for axis, path in enumerate(columns.axes):
         positions[:, axis] = rows.floats(path, METRES)
+    positions[_are_null(rows, columns, positions)] = NOWHERE
     speeds = np.full(times.size, np.nan)
     if columns.velocity:
         speeds = np.abs(rows.floats(columns.velocity[0], VELOCITY))
@@ -260,6 +263,17 @@ def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:
             speeds = np.hypot(speeds, rows.floats(path, VELOCITY))
     turns, frames = _turns(rows, columns, times.size), _frames_of(rows, columns, times.size)
     return Poses(times, positions, turns, FrameCodes(frames.codes, frames.words), speeds)
+
+
+def _are_null(rows: _RoundedRows, columns: _Columns, positions: Vectors) -> Flags:
+    """Returns which poses are null: position and quaternion are zero, as where tracking is lost."""
+    are_null: Flags = row_maxima(np.abs(positions)) <= AT_ORIGIN_M
+    if len(columns.turn) < 4:  # a heading of 0 is one
+        return np.zeros_like(are_null)
+    if are_null.any():
+        for path in columns.turn:
+            are_null &= rows.floats(path, EXACT) == 0
+    return are_null
 
 
 def _turns(rows: _RoundedRows, columns: _Columns, count: int) -> Vectors:

@@ -239,7 +239,9 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
     messages = [odom((T0 + at) * S, float("nan")) for at in range(3)]
     memory = remembered(tmp_path, [*messages, odom((T0 + 3) * S, 1.0)])
     told = asked(memory, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
-    assert told["notes"] == ["the recorded position is not a number"]
+    assert told["notes"] == [
+        "the recorded pose is no place: NaN, or all zeros, as where tracking is lost"
+    ]
     assert all("notes" not in each for each in told["results"])
     alone = asked(memory, "get_position_at", timestamps=[T0, T0 + 3])
     assert [each.get("notes") for each in alone["results"]] == [told["notes"], None]

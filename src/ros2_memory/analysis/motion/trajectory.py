@@ -358,7 +358,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
     totals = path.totals
     if path.invalid:
         poses = counted(path.invalid, "pose")
-        yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
+        yield f"{poses} left out: their coordinates are not valid (NaN, all zeros or out of range)"
     if path.is_noisy:
         # Without numbers, so that several windows share one note; the reply has them.
         yield (
