@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
+    from ros2_memory.core.timebase import Ns
 
 
 _FEWEST_OF_MOVERS: Final = 10
@@ -286,12 +287,15 @@ def _link(group: LabelGroup, observed: Observations) -> list[Instance]:
 
 
 def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool) -> list[Instance]:
-    """Returns things whose stays follow one another, at the same place if they can.
+    """Returns things whose stays follow one another, at the same place if they can, or near it.
 
-    With `proven` a thing goes on only from a stay that is known to have ended.
+    With `proven` a thing goes on only from a stay that is known to have ended. One that is seen
+    near its place again was not elsewhere meanwhile, if another one may have been.
     """
     instances: list[Instance] = []
-    for stay in sorted(stays, key=lambda stay: stay.firm_first):
+    stays = sorted(stays, key=lambda stay: stay.firm_first)
+    seen_near = dict(zip(map(id, stays), _seen_near(stays), strict=True))
+    for stay in stays:
         ended = [
             instance
             for instance in instances
@@ -304,10 +308,30 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
         if not ended:
             instances.append(Instance(group.key, group.epoch, [stay]))
             continue
-        lasts = [instance.stays[-1] for instance in ended]
-        preferred = [(last.place == stay.place, last.last) for last in lasts]
+        preferred = [
+            (
+                last.place == stay.place,
+                not _is_far(last, stay),
+                seen_near[id(last)] < stay.firm_first,
+                last.last,
+            )
+            for last in (instance.stays[-1] for instance in ended)
+        ]
         ended[preferred.index(max(preferred))].stays.append(stay)
     return instances
+
+
+def _seen_near(stays: Sequence[PlacedStay]) -> Iterator[Ns]:
+    """Yields for each stay when (ns) the newest stay near it began; it may be the stay itself."""
+    x, y, z = np.array([(stay.x, stay.y, stay.z) for stay in stays]).reshape(-1, 3).T
+    begun = np.array([stay.firm_first for stay in stays], np.int64)
+    by_x = stable_order(x)
+    begins, ends = (np.searchsorted(x[by_x], x + reach) for reach in (-GATE_MM, GATE_MM))
+    for nth, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+        beside = by_x[begin:end]
+        is_near = np.hypot(x[beside] - x[nth], y[beside] - y[nth]) <= GATE_MM
+        is_near &= np.abs(z[beside] - z[nth]) <= STOREY_MM
+        yield int(begun[beside[is_near]].max(initial=begun[nth]))
 
 
 def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:

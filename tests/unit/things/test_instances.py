@@ -97,6 +97,40 @@ def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place(
     assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
 
 
+LEFT, RIGHT = (0.0, 0.0, 0.9), (0.0, 0.0, -0.9)
+
+
+def test_of_two_things_each_is_the_one_that_was_near_where_the_map_shifted() -> None:
+    """The one that is seen again first is not the one that was seen last."""
+
+    def shifted(by: float) -> tuple[Detections, Detections]:
+        return seen_at(2 + by, 1.8), seen_at(2 + by, -1.8)
+
+    (left, right), (later_left, later_right) = shifted(0.0), shifted(0.4)
+    found = estimated(
+        *[(HERE, left + right)] * 300,
+        *[(RIGHT, right)] * 60,
+        *[(LEFT, later_left)] * 60,
+        *[(HERE, later_left + later_right)] * 300,
+    )
+    sides = [[stay.y > 0 for stay in thing.stays] for thing in found.instances]
+    assert sorted(sides) == [[False, False], [True, True]]
+
+
+def test_what_came_from_far_is_the_thing_that_is_not_seen_again_near_its_old_place() -> None:
+    kitchen, study, hall = (0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (40.0, 0.0, 0.0)
+    before = [*[(kitchen, seen_at(2, 0))] * 150, *[(study, seen_at(22, 0))] * 150]
+    found = estimated(
+        *before,
+        *before,
+        *[(hall, seen_at(42, 0))] * 300,
+        *[(kitchen, [])] * 300,
+        *[(study, seen_at(22.4, 0))] * 300,
+    )
+    places = [[round(stay.x / 10_000) for stay in thing.stays] for thing in found.instances]
+    assert sorted(places) == [[0, 4], [2, 2]]
+
+
 @pytest.mark.parametrize(
     ("one", "other"),
     [
