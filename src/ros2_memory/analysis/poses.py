@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ros2_memory.core.arrays import (
-    Flags,
     Floats,
     Vectors,
     joined_codes,
+    row_sums,
     rows_of,
     run_starts,
     stable_order,
@@ -30,12 +31,19 @@ if TYPE_CHECKING:
 
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """The least time between two poses by transforms."""
-WANDERS_M: Final = 0.02
-"""The standard deviation with which the position of a robot at rest may wander, as that of a filter
-with a satellite receiver does. This is no noise from pose to pose, which averages out."""
-_RESTING_MPS: Final = 0.02
 SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
 """The time over which poses are averaged to find out whether the robot stands."""
+REST_NS: Final[Ns] = 15 * NS_PER_S
+"""So much time at most shows whether a position wanders at rest."""
+_REST_SLOTS: Final = 15
+"""So many slots with poses show it: a robot that creeps with 5 cm/s gets farther in them."""
+_REST_M: Final = 0.2
+"""How far from each other their means may be."""
+_ALIKE: Final = 0.5
+"""What wanders has steps from slot to slot in other directions: the mean cosine between two is
+less. Those of an averaged random walk have 0.2, and those of a straight drive 1."""
+_OF_STEPS: Final = 1.5
+"""The standard deviation of what wanders is taken for so many usual steps."""
 
 
 class FrameCodes(NamedTuple):
@@ -86,21 +94,48 @@ class Poses:
             self.speeds[which],
         )
 
-    def at_rest(self) -> Flags:
-        """Returns which poses are of a robot at rest, by the mean speed stated in their slot.
+    def wander_m(self) -> Floats:
+        """Returns by how much (m) the position wanders at rest: 0 where the robot may move.
 
-        A speed of 0 shows nothing: some publishers leave the twist out, and the odometry of wheels
-        that stand does not wander.
+        At rest, positions stay near for a while, and their steps lead in no direction.
         """
-        begins = run_starts(self.times // SLOT_NS)
-        sizes = np.diff(begins, append=len(self))
-        means_mps = np.add.reduceat(self.speeds, begins) / sizes if len(self) else self.speeds
-        return np.repeat((means_mps > 0) & (means_mps <= _RESTING_MPS), sizes)
+        slots = self.times // SLOT_NS
+        begins = run_starts(slots)
+        if begins.size < _REST_SLOTS:
+            return np.zeros(len(self))
+        counts = np.diff(begins, append=len(self))
+        means = np.add.reduceat(self.positions - np.rint(self.positions[0]), begins)
+        means /= counts[:, None]
+        return np.repeat(_slots_wander_m(slots[begins], means), counts)
 
     def between(self, start: int, stop: int) -> Poses:
         """Returns the poses with log times (ns) in `[start, stop)`."""
         first, end = np.searchsorted(self.times, (start, stop)).tolist()
         return self.rows(slice(first, end))
+
+
+def _slots_wander_m(slots: IntArray, means: Vectors) -> Floats:
+    """Returns by how much (m) the mean position of each slot wanders; see `Poses.wander_m`.
+
+    Of the windows of slots around it that show no motion, the one with the longest steps counts.
+    """
+    windows = sliding_window_view(means, _REST_SLOTS, axis=0)
+    sizes = windows.max(axis=2) - windows.min(axis=2)
+    steps = np.diff(means, axis=0)
+    squares = row_sums(steps * steps)
+    lengths = np.sqrt(squares[1:] * squares[:-1])
+    # Where a step is zero, nothing wanders.
+    cosines = np.ones(lengths.size)
+    np.divide(row_sums(steps[1:] * steps[:-1]), lengths, out=cosines, where=lengths > 0)
+    is_rest = (
+        (slots[_REST_SLOTS - 1 :] - slots[: 1 - _REST_SLOTS] < REST_NS // SLOT_NS)
+        & (row_sums(sizes * sizes) <= _REST_M * _REST_M)
+        & (sliding_window_view(cosines, _REST_SLOTS - 2).mean(axis=1) < _ALIKE)
+    )
+    medians = np.median(sliding_window_view(squares, _REST_SLOTS - 1), axis=1)
+    of_windows = np.pad(np.where(is_rest, _OF_STEPS * np.sqrt(medians), 0.0), _REST_SLOTS - 1)
+    wander_m: Floats = sliding_window_view(of_windows, _REST_SLOTS).max(axis=1)
+    return wander_m
 
 
 NO_POSES: Final = Poses(

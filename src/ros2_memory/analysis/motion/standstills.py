@@ -5,7 +5,7 @@ It begins with the first pose at its place and ends with the last one.
 
 - **Slots.** Poses are averaged in slots of `SLOT_NS`, so that noise averages out. Consecutive slots
   are linked if a drift of `DRIFT_MPS`, or the noise of their poses, explains the distance of their
-  means, or the wandering of a position at rest (`Poses.at_rest`). Linked slots form a chain. Its
+  means, or the wandering of a position at rest (`Poses.wander_m`). Linked slots form a chain. Its
   first and last slot may be half motion and are left out.
 - **Blocks.** Noise may hide slow motion from two slots, but not from the slots of a block of
   `BLOCK_NS`. A block whose means spread farther than drift and noise explain is motion, and splits
@@ -43,7 +43,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.poses import SLOT_NS, WANDERS_M, Poses, headings
+from ros2_memory.analysis.poses import REST_NS, SLOT_NS, Poses, headings
 from ros2_memory.core.arrays import (
     Flags,
     Floats,
@@ -71,7 +71,7 @@ SHORTEST_NS: Final = 3 * NS_PER_S
 SILENCE_NS: Final = 5 * NS_PER_S // 2
 """Between poses farther apart nothing is known: a standstill ends there."""
 BLOCK_NS: Final = 5 * SLOT_NS
-BESIDE_NS: Final = SHORTEST_NS + 3 * NS_PER_S
+BESIDE_NS: Final = REST_NS + SHORTEST_NS + 3 * NS_PER_S
 """Poses so far before and after a stretch of time take part in its blocks."""
 CREEP_NS: Final = 15 * BLOCK_NS
 """A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
@@ -80,6 +80,8 @@ CONTEXT_NS: Final = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
 DRIFT_MPS: Final = 0.008
 """How fast odometry may drift while the robot stands."""
 LARGEST_M: Final = 0.1
+_WIDEST_M: Final = 0.15
+"""No noise explains a larger box around the means of a block."""
 DRIFTED_M: Final = 1.0
 """How far odometry may drift in one standstill."""
 CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
@@ -210,7 +212,7 @@ class Blocks:
         """Returns in which blocks drift and noise explain the spread of the means."""
         lows, highs = self.corners()
         explained_m = np.maximum(_STILL_M, _BOX_NOISE_FACTOR * self.noises.astype(np.float64))
-        return _lengths(highs - lows) <= np.minimum(explained_m, LARGEST_M)
+        return _lengths(highs - lows) <= np.minimum(explained_m, _WIDEST_M)
 
     @property
     def memory_bytes(self) -> int:
@@ -355,7 +357,7 @@ class _Slots:
         self.counts = self.stops - self.begins
         self.numbers = slots[self.begins]
         self.firsts, self.lasts = times[self.begins], times[self.stops - 1]
-        self.wander_m = np.where(poses.at_rest()[self.begins], WANDERS_M, 0.0)
+        self.wander_m = poses.wander_m()[self.begins]
 
     def __len__(self) -> int:
         return self.begins.size
@@ -578,7 +580,8 @@ def _left_blocks(blocks: Blocks, chain: Ints, is_still: Flags) -> Ints:
         before = waiting - lag
         near = numbers[waiting] - numbers[before] < _CREEP_BLOCKS
         apart_m = _lengths(centres[waiting] - centres[before])
-        far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
+        explained_m = 4 * np.minimum(noises[waiting], noises[before])
+        far = near & (apart_m > LARGEST_M + explained_m)
         left[waiting[far]] = before[far]
     return left
 

@@ -26,11 +26,12 @@ from ros2_memory.analysis.motion.odometry import (
     measured_path,
 )
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.poses import WANDERS_M, Poses, headings, joined_poses
+from ros2_memory.analysis.poses import Poses, headings, joined_poses
 from ros2_memory.core.arrays import (
     Flags,
     Floats,
     Vectors,
+    row_sums,
     rows_of,
     runs_where,
     stable_order,
@@ -65,8 +66,8 @@ _OF_TIME: Final = 0.7
 are right within 2.5 cm."""
 _FEW: Final = 32
 """Neighbouring slices with at most so many poses each are measured together."""
-_WIDEST_WANDER: Final = 5.0
-"""A position at rest is at most so many standard deviations from its place, on each axis."""
+_WIDEST_WANDER_M: Final = 0.3
+"""Positions of one place at rest are no farther apart."""
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
 _BYTES: Final = 3000
@@ -279,15 +280,19 @@ def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathS
 
 
 def _without_wander(poses: Poses) -> Vectors:
-    """Returns the positions (m); those of a rest are one place, if they are that near to it."""
-    positions, at_rest = poses.positions, poses.at_rest()
+    """Returns the positions (m); those of a rest are one place, as long as they are near it."""
+    positions, at_rest = poses.positions, poses.wander_m() > 0
     if not at_rest.any():
         return positions
     positions = positions.copy()
     for begin, end in runs_where(at_rest).tolist():
-        place = positions[begin:end].mean(axis=0)
-        if (np.abs(positions[begin:end] - place) <= _WIDEST_WANDER * WANDERS_M).all():
-            positions[begin:end] = place
+        rest = positions[begin:end]
+        while len(rest):
+            sizes = np.maximum.accumulate(rest) - np.minimum.accumulate(rest)
+            # Both only grow along a rest: the poses that are near are the first ones.
+            near = int((row_sums(sizes * sizes) <= _WIDEST_WANDER_M * _WIDEST_WANDER_M).sum())
+            rest[:near] = rest[:near].mean(axis=0)
+            rest = rest[near:]
     return positions
 
 
