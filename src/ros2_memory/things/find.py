@@ -38,6 +38,7 @@ from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import (
     ThingsQuestion,
     describe_hung,
+    lone_notes,
     look_alike_notes,
     note_undecoded,
     notes_on,
@@ -118,6 +119,8 @@ def find_things(
     view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
     last_stays = _last_stays(found[:limit])
     view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
+    movers = [(each.thing, each.rows) for each in found if isinstance(each.thing, Mover)]
+    view.notes.add(*lone_notes(known, movers))
     totals = _totals(found)
     question = ThingsQuestion(
         labels=wanted,

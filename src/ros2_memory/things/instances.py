@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Spot, Unplaced
+from ros2_memory.analysis.sights import SLICE_NS, Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Flags, Groups, Ints, begins_of, in_ranges, narrowed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.things.places import visits_of
@@ -237,6 +237,21 @@ class Estimate:
     def is_vague(self, rows: Ints) -> bool:
         """Returns whether the newest of the spots was seen while localisation was poor."""
         return bool(self.poor[rows[self.spots[rows, Spot.LAST].argmax()]])
+
+    def alone_among(self, spot: int, mover: Mover) -> int:
+        """Returns in how many messages, up to `SLICE_NS` around it, a spot is the only detection.
+
+        They are of its topic. 0 if the mover has other detections in this time.
+        """
+        names = (Spot.FIRST, Spot.LAST, Spot.TOPIC)
+        first, last, topic = (self.spots[spot, name] for name in names)
+        start, stop = first - SLICE_NS, last + SLICE_NS
+        others = self.spots[mover.spots]
+        is_near = (others[:, Spot.LAST] >= start) & (others[:, Spot.FIRST] <= stop)
+        if self.counts[mover.spots[is_near]].sum() > 1:
+            return 0
+        is_around = (self.looks.last >= start) & (self.looks.first <= stop)
+        return int(self.looks.n[is_around & (self.looks.topic == topic)].sum())
 
     def place_of(self, stay: PlacedStay, rows: Ints) -> Vector3:
         """Returns the mean place (m) of a stay's spots, or of the whole stay if all are poor."""

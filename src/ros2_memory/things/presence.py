@@ -128,7 +128,8 @@ class Cells:
     @property
     def looks(self) -> Looks:
         """The columns of looks that answers need."""
-        return Looks(self.slice, self._first, self.last, self.x, self.y, self.yaw, self.cell)
+        times = self.slice, self._first, self.last
+        return Looks(*times, self.x, self.y, self.yaw, self.cell, self.topic, self.n)
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from cells, as keys of places."""
@@ -278,6 +279,8 @@ class Looks(NamedTuple):
     y: Ints
     yaw: Ints
     cell: Ints
+    topic: Ints
+    n: Ints
 
 
 class Stay(NamedTuple):

@@ -60,13 +60,15 @@ if TYPE_CHECKING:
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.conditions import Sought
     from ros2_memory.history.view import View
-    from ros2_memory.things.instances import Instance, Move, PlacedStay
+    from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
 _SCATTERS: Final = 3.0
 """Things of one label that are no farther apart than so many times their scatter may be one."""
 _SAME_PLACE_M: Final = 0.2
+_MANY_MESSAGES: Final = 10
+"""What is seen in one of so many messages may be mistaken."""
 _MOST_TYPES: Final = 3
 """The constants of this many types are looked up: each reads the channels of a file."""
 _ARTICLE: Final = re.compile(r"^(?:an?|the) ")
@@ -391,6 +393,27 @@ def vague_notes(
             f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
             labels,
         )
+
+
+def lone_notes(known: KnownThings, movers: Iterable[tuple[Mover, Ints]]) -> Iterator[str]:
+    """Yields which movers were last seen by a detection alone, and when before that.
+
+    Of what stays at a place such a detection does not count; a mover may be anywhere. Each comes
+    with its spots in a window.
+    """
+    estimate = known.estimate
+    for mover, rows in movers:
+        *before, last = np.sort(estimate.spots[rows, Spot.LAST]).tolist()
+        newest = int(rows[estimate.spots[rows, Spot.LAST] == last][0])
+        messages = estimate.alone_among(newest, mover)
+        if messages >= _MANY_MESSAGES:
+            name = estimate.names[mover.key]
+            earlier = f"; before that at {unix_text(before[-1])}" if before else ""
+            yield repeating(
+                f"{name} was last seen in 1 of {messages} messages, which may be a false "
+                f"detection: find_matches has its score{earlier}",
+                [name],
+            )
 
 
 def crowded_notes(known: KnownThings) -> Iterator[str]:

@@ -513,6 +513,26 @@ def test_people_are_counted_in_the_region_that_is_asked_for(tmp_path: Path) -> N
     assert ask(tmp_path, label="cup", near={"label": "person", "radius_m": 1})["total"] == 1
 
 
+@pytest.mark.parametrize(
+    ("every_s", "at_once", "is_lone"), [(1, 1, True), (1, 2, False), (8, 1, False)]
+)
+def test_a_person_last_seen_in_one_of_many_messages_may_be_a_false_detection(
+    tmp_path: Path, every_s: int, at_once: int, is_lone: bool
+) -> None:
+    """Not so where the detector hardly ever has a message, or saw two."""
+    there = looked(0, 100, HERE, ("person", 3.0, 0.0))
+    later = [
+        message
+        for at in range(3600, 3664, every_s)
+        for message in scene(at, HERE, [("person", 4.0, -1.0)] * at_once if at == 3632 else [])
+    ]
+    reply = told_of(tmp_path, [*there, *later], label="person")
+    assert reply["things"][0]["last_seen"] == BEGIN + 3632
+    notes = [note for note in reply.get("notes", []) if "false detection" in note]
+    assert [note.rpartition(" ")[2] for note in notes] == [f"{BEGIN + 99}.000000"] * is_lone
+    assert all("person was last seen in 1 of 30 messages" in note for note in notes)
+
+
 def alternating(*labels: str, y: float = 0.5, begin: int = 0) -> list[Msg]:
     """A thing that each message names otherwise, with 5 cm of noise."""
     draw = Random(1)
