@@ -39,7 +39,7 @@ from ros2_memory.core.arrays import (
     range_numbers,
     stable_order,
 )
-from ros2_memory.core.text import LISTS_OF_LABELS, looks_like_json
+from ros2_memory.core.text import looks_like_json
 from ros2_memory.messages.detections import (
     MAX_DEPTH,
     POSITIONS,
@@ -48,6 +48,7 @@ from ros2_memory.messages.detections import (
     detections_of,
     has_more_content,
     hypotheses_field,
+    lists_of_seen,
     naming_fields,
 )
 
@@ -297,9 +298,10 @@ def _walk(node: Node, depth: int, frames: tuple[Leaf, ...], least: float | None)
     frames += _frame_leaves(node)
     inner: list[Source] = []
     fields: dict[str, Node] = {}
+    seen = lists_of_seen(node)
     for name, part in node.items():
         element = part.element if isinstance(part, Listing) else None
-        if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
+        if name in seen and isinstance(element, Leaf) and element.kind is Kind.TEXT:
             inner.append(Words(element))
         fields[name], sources = _walk(part, depth - 1, frames, least)
         if isinstance(part, Leaf) and has_more_content(node):

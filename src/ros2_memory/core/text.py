@@ -40,6 +40,8 @@ _ELLIPSIS: Final = "…"
 LABELS: Final = ("label", "class_id", "class_name", "class", "object")
 """Fields that may have the label of a detection; the first one that a message has counts."""
 LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
+LOOKED_FOR: Final = "classes"
+"""Without a list or an object beside it, this list says what a detector is to look for."""
 NAMED_IN_TYPES: Final = {
     frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
     frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs

@@ -1,7 +1,8 @@
 """Reads detections from messages: the name of what a detector saw, its place and its score.
 
 - A detection is an object with a name under one of `naming_fields`: an entry of a list, or the
-  whole message. A list of strings under one of `LISTS_OF_LABELS` is a list of detections.
+  whole message. A list of strings under one of `LISTS_OF_LABELS` is a list of detections, unless it
+  is under `LOOKED_FOR` without another list or object beside it, as of scores.
 - An object without a name, but with a list of hypotheses under one of `HYPOTHESES`, is a detection
   that is named by the best of them.
 - A string that is JSON is parsed. An object in it is a detection if it is in a list, has a score, a
@@ -21,11 +22,17 @@ from itertools import product
 from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, NAMED_IN_TYPES, looks_like_json
+from ros2_memory.core.text import (
+    LABELS,
+    LISTS_OF_LABELS,
+    LOOKED_FOR,
+    NAMED_IN_TYPES,
+    looks_like_json,
+)
 from ros2_memory.messages.conversions import NamedNumber, number, triple, xyz
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.core.reply import JsonObject
@@ -197,8 +204,9 @@ class _Walk:
             self.detections.append(_detection_at((best, value), frame, best_label, score))
             return self._without_low_hypotheses(value, field, best)
         fields: JsonObject = {}
+        seen = lists_of_seen(value)
         for name, part in value.items():
-            if name in LISTS_OF_LABELS and isinstance(part, list):
+            if name in seen and isinstance(part, list):
                 labels = (element for element in part if isinstance(element, str) and element)
                 self.detections += map(Detection, labels)
             is_leaf = not part or isinstance(part, int | float)  # most are: no call for each
@@ -229,6 +237,15 @@ class _Walk:
 def hypotheses_field(fields: Collection[str]) -> str | None:
     """Returns which of the fields of an object has its hypotheses; None if none has."""
     return next((name for name in HYPOTHESES if name in fields), None)
+
+
+def lists_of_seen(fields: Mapping[str, object]) -> frozenset[str]:
+    """Returns under which of its fields an object may list the labels of what was seen."""
+    is_beside = LOOKED_FOR in fields and any(
+        isinstance(part, list | dict) and name != LOOKED_FOR and name not in _NO_CONTENT
+        for name, part in fields.items()
+    )
+    return LISTS_OF_LABELS if is_beside else LISTS_OF_LABELS - {LOOKED_FOR}
 
 
 def has_more_content(fields: Collection[str]) -> bool:

@@ -139,6 +139,24 @@ def test_json_that_names_something_in_a_state_detects_nothing(
 @pytest.mark.parametrize(
     ("beside", "labels"),
     [
+        ({}, []),
+        ({"header": {"stamp": 1.0, "frame_id": "camera"}, "threshold": 0.3}, []),
+        ({"scores": [0.4]}, ["cup"]),
+        ({"boxes": []}, ["cup"]),
+    ],
+)
+def test_the_classes_that_a_detector_is_to_look_for_are_not_seen(
+    beside: JsonObject, labels: list[str]
+) -> None:
+    """An open-vocabulary detector is prompted with them; among what it saw are scores or boxes."""
+    classes: JsonObject = {"classes": ["cup"], **beside}
+    for value in (classes, {"data": json.dumps(classes)}, {"detections": [classes]}):
+        assert [seen.label for seen in detections_of(value)] == labels
+
+
+@pytest.mark.parametrize(
+    ("beside", "labels"),
+    [
         ({}, ["glasses"]),
         ({"header": {"stamp": 1.0, "frame_id": ""}}, ["glasses"]),
         ({"intent": "find_object", "confidence": 0.8}, []),

@@ -607,6 +607,15 @@ def test_what_a_user_asked_for_was_not_seen(tmp_path: Path, recalls: bool) -> No
     assert "glasses in view" not in str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
 
 
+@each_way
+def test_what_a_detector_is_told_to_look_for_was_not_seen(tmp_path: Path, recalls: bool) -> None:
+    prompts = text((BEGIN + 5) * S, '{"classes": ["cup", "bottle"]}', topic="/prompts")
+    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), prompts])
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert "bottle" not in str(asked(memory, "find_things"))
+    assert "bottle in view" not in str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
+
+
 @pytest.mark.parametrize("label", ["forklift", "Fork_Lift", "forklifts"])
 def test_labels_that_differ_in_spacing_only_name_one_thing(tmp_path: Path, label: str) -> None:
     """Two detectors write it otherwise, and each saw it at another time."""
