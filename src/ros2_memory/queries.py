@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory import results
@@ -147,6 +148,10 @@ _REACH_M: Final = 0.05
 _THINNED_POSES_NS: Final = 3 * NS_PER_S
 """The longest time between two poses of a thinned day, while poses were recorded."""
 _ROUNDING_MPS: Final = 0.01
+_MOST_TRIED: Final = 1000
+"""So many poses at most are tried to place one in another frame."""
+_CORRECTED_NS: Final = 2 * NS_PER_S
+"""A map is mostly corrected more often."""
 _ENDED_GOALS: Final = (
     "these messages list the numbers of statuses, of goals also for minutes after they ended: "
     'find_matches, such as contains "aborted", finds each goal with when it ended'
@@ -393,7 +398,7 @@ def position(
     message = require_decoded(view, stored)
     pose, geodetic = view.extractor.pose(message, stored.type), None
     if pose is not None:
-        pose = _place_pose(view, stored, pose, frame_id)
+        stored, pose = _newest_placed(asked, stored, pose, frame_id)
     else:
         geodetic = view.extractor.geodetic(message, stored.type)
         if geodetic is None:
@@ -410,6 +415,43 @@ def _note_geodetic(view: View, geodetic: Geodetic) -> None:
         view.notes.add(_NOT_A_NUMBER)
     if not geodetic.has_fix:
         view.notes.add("no fix: the receiver states that this is not its position")
+
+
+def _newest_placed(
+    asked: _Asked, newest: StoredMessage, pose: Pose, frame_id: str | None
+) -> tuple[StoredMessage, Pose]:
+    """Returns the newest message whose pose can be placed in `frame_id`, and its pose there.
+
+    A map is corrected more rarely than poses come: transforms may not lead there from the newest.
+
+    Raises:
+        NoDataError: none within the tolerance can be placed; it names the tolerance that suffices.
+    """
+    try:
+        return newest, _place_pose(asked.view, newest, pose, frame_id)
+    except NoDataError as error:
+        start = min(asked.window.start, asked.at - _CORRECTED_NS)
+        older = _last_placed(asked.view, newest.topic, TimeWindow(start, newest.time), frame_id)
+        if older is None:
+            raise
+        if older[0].time < asked.window.start:
+            detail = f"{error.detail}; or, {accepting(older[0], asked.at)}"
+            raise NoDataError(error.reason, detail, error.notes) from error
+        return older
+
+
+def _last_placed(
+    view: View, topic: str, window: TimeWindow, frame_id: str | None
+) -> tuple[StoredMessage, Pose] | None:
+    """Returns the newest message of a window whose pose can be placed in `frame_id`, or None."""
+    messages = view.stream.messages([topic], window, newest_first=True)
+    for stored in islice(messages, _MOST_TRIED):
+        message = view.bags.decode(stored)
+        pose = None if message is None else view.extractor.pose(message, stored.type)
+        with suppress(NoDataError):
+            if pose is not None:
+                return stored, _place_pose(view, stored, pose, frame_id)
+    return None
 
 
 def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | None) -> Pose:
@@ -483,8 +525,9 @@ def _unplaced_error(asked: _Asked, frame_id: str | None) -> NoDataError:
     try:
         if body is not None:
             parent = frame_id or body.parent
-            frame_history.transform_at(view, parent, body.child, at)
             error = _too_old_error(asked, body, parent)
+            if error is None:
+                frame_history.transform_at(view, parent, body.child, at)
         error = error or no_data_at(view, view.moving_topics, at, asked.tolerance)
     except NoDataError as no_transform:
         error = with_notes(view, near, no_transform)

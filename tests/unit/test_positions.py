@@ -617,3 +617,24 @@ def test_of_several_topics_of_poses_the_refusal_says_which_is_best(tmp_path: Pat
     )
     beside = asked(remembered(tmp_path, [*poses, *moved(range(5))]), "visits", x=1.0, y=0.0)
     assert ", or to /tf to place the robot by transforms, or give topic" in beside["detail"]
+
+
+@pytest.mark.parametrize("topic", ["/odom", "/tf"])
+def test_a_pose_that_a_rare_correction_of_the_map_does_not_reach_yet_gives_way_to_one_before(
+    tmp_path: Path, topic: str
+) -> None:
+    """Odometry comes 20 times a second, and the map is corrected twice a second."""
+    messages: list[Msg] = []
+    for nth in range(100):
+        at, x = T0 + nth * S // 20, nth * 0.05
+        body = transform(at, "odom", "base_link", (x, 0.0, 0.0), 0.0)
+        messages += [odom(at, x, 0.0, 0.0), tf(at, body)]
+        if nth % 10 == 1:
+            messages.append(tf(at, transform(at, "map", "odom", (3.0, 0.0, 0.0), 0.0)))
+    write_mcap(tmp_path / "run_0.mcap", messages)
+    ask = partial(asked, memory_of(tmp_path), "get_position_at", topic=topic, frame_id="map")
+    assert "no transform" in ask(timestamp=T0_S + 4.95)["detail"]
+    assert "ask with tolerance_s of at least 0.4" in ask(timestamp=T0_S + 4.95)["detail"]
+    found = ask(timestamp=T0_S + 4.95, tolerance_s=0.45)
+    assert (found["timestamp"], found["x"]) == (T0_S + 4.55, pytest.approx(7.55))
+    assert ask(timestamp=T0_S + 4.95, tolerance_s=0.3)["error"] == "no_data"
