@@ -198,8 +198,8 @@ def parts_of(
     """Returns the splits among the closed bags of a recording, by part.
 
     A part is searched in order of time. Another one (`rec_A#7`, by its first split) begins where
-    the clock was set back, and behind a split that cannot be read: that may still come. `searched`
-    has until which log time each part was searched.
+    the clock was set back, and behind a split that cannot be read, also the first: that may still
+    come. `searched` has until which log time each part was searched.
     """
     splits: dict[int, BagFile] = {}
     for bag in bags:
@@ -207,7 +207,8 @@ def parts_of(
         if number is not None:
             splits[number] = bag
     parts: dict[str, list[BagFile]] = {}
-    part, end, last = recording, MIN_NS, MAX_NS
+    part, end = recording, MIN_NS
+    last = MAX_NS if recording in searched else -1
     for nth, bag in sorted(splits.items()):
         # Behind a split that was searched and then deleted, nothing begins.
         is_unsearched = bag.start >= searched.get(part, MIN_NS) - OUT_OF_ORDER_NS

@@ -396,20 +396,23 @@ def test_a_split_that_was_deleted_before_it_could_be_read_stays_a_problem(
     assert (lost.name in said, other.name in said) == (True, True)
 
 
-def test_a_first_split_that_is_readable_too_late_stays_a_problem(
+def test_a_first_split_that_is_readable_late_is_searched_then(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot.begin(T0)
     with monkeypatch.context() as failing:
         first = robot.split(seconds(0, 10, {5}))
         fail_to_summarize(failing, first)
-        robot.split(seconds(10, 20))
-        robot.clock.at = T0 + 20 * S
+        robot.split(seconds(10, 20, {12}))
+        robot.split(seconds(20, 30))
+        robot.clock.at = T0 + 30 * S
         robot.look()
+        assert robot.fired_at() == [T0 + 12 * S]
+        assert first.name in (robot.problem() or "")
     robot.clock.at = T0 + 300 * S
     robot.close_all()
-    assert robot.fired_at() == []
-    assert first.name in (robot.problem() or "")
+    assert [(at - T0) // S for at in robot.fired_at()] == [5, 12]
+    assert robot.problem() is None
 
 
 def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> None:
