@@ -93,12 +93,16 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
         assert reply["duration_s"] == pytest.approx(100 - by, abs=0.05)
         later = asked(memory, "recap", start=BEGIN + 100, end=BEGIN + 150)
         assert "clock steps" not in later["counts"]
+        skipped = asked(memory, "get_position_at", timestamp=at + by / 2)
+        assert "the clock skipped this time, as it was set ahead" in skipped["detail"]
 
 
-def test_what_the_clock_skipped_is_neither_recorded_nor_missing(tmp_path: Path) -> None:
-    """A window from 100 s before the memory to its end; a moment, and a window, in the step."""
+def test_what_the_clock_skipped_is_neither_recorded_nor_missing_nor_unknown(tmp_path: Path) -> None:
+    """A window from 100 s before the memory to its end, one that ends in the step; and in it."""
     plain = recorded(tmp_path, shown=lambda t: t + 500.0 * (t > 54.95))
     note = f"the clock was set 500 s ahead at {BEGIN + 54}.900000: durations are without that"
+    cut = {"start": BEGIN + 5, "end": BEGIN + 300}
+    later = {"with_start": BEGIN + 400, "with_end": BEGIN + 600}
     for memory in each_known(plain):
         reply = asked(memory, "recap", start=BEGIN - 100, end=BEGIN + 659.9)
         assert note in reply["notes"]
@@ -110,20 +114,12 @@ def test_what_the_clock_skipped_is_neither_recorded_nor_missing(tmp_path: Path) 
             asked(memory, "get_topic_in_range", **inside),
         ):
             assert (missing["error"], missing["notes"]) == ("no_data", [note])
-
-
-def test_a_window_that_ends_in_what_the_clock_skipped_lacks_nothing(tmp_path: Path) -> None:
-    plain = recorded(tmp_path, shown=lambda t: t + 500.0 * (t > 54.95))
-    cut = {"start": BEGIN + 5, "end": BEGIN + 300}
-    note = f"the clock was set 500 s ahead at {BEGIN + 54}.900000: durations are without that"
-    for memory in each_known(plain):
-        later = {"with_start": BEGIN + 400, "with_end": BEGIN + 600}
         assert asked(memory, "recap", **cut)["notes"] == [note]
         assert asked(memory, "visits", x=0.0, y=0.0, **cut)["notes"] == [note]
         told = asked(memory, "compare", **cut, **later)["notes"]
         assert [each for each in told if "known" in each or "poses" in each] == []
-        inside = asked(memory, "data_time_range", start=BEGIN + 200, end=BEGIN + 300)
-        assert [step["step_s"] for step in inside["clock_steps"]] == [pytest.approx(500, abs=0.1)]
+        within = asked(memory, "data_time_range", start=BEGIN + 200, end=BEGIN + 300)
+        assert [step["step_s"] for step in within["clock_steps"]] == [pytest.approx(500, abs=0.1)]
 
 
 def test_the_age_of_a_latched_value_is_without_what_the_clock_skipped(tmp_path: Path) -> None:
@@ -182,17 +178,6 @@ def test_a_clock_that_was_set_forward_is_reported_whatever_places_the_robot(
             }
         ]
         assert asked(each, "data_time_range")["gaps"] == []
-
-
-def test_the_time_that_a_clock_skipped_is_neither_recorded_nor_unknown(tmp_path: Path) -> None:
-    memory = recorded(tmp_path, shown=lambda t: t + 95 * (t > 79.95))
-    whole = {"start": BEGIN, "end": BEGIN + 400}
-    notes = asked(memory, "trajectory_summary", **whole)["notes"]
-    assert f"recorded only 160 of 305 s between {BEGIN}.000000 and {BEGIN + 400}.000000" in notes
-    other = {"with_start": BEGIN, "with_end": BEGIN + 50}
-    assert "is not known from" not in str(asked(memory, "compare", **whole, **other)["notes"])
-    error = asked(memory, "get_position_at", timestamp=BEGIN + 100)
-    assert "the clock skipped this time, as it was set ahead" in error["detail"]
 
 
 def steps(memory: Memory) -> list[Any]:

@@ -1,7 +1,7 @@
 """What happened in a time, what became of goals, what changed before and after a moment."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 from pathlib import Path
 from random import Random
@@ -318,19 +318,20 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
 
 
 @each_way
-def test_the_last_percent_of_a_battery_is_no_full_one(tmp_path: Path, recalls: bool) -> None:
-    percents = [battery(at(t), max(6 - t * 0.1, 0.8)) for t in range(60)]
-    write_splits(tmp_path, [*percents, boolean(at(59), True)])
-    memory = memory_of(tmp_path, recalls=recalls)
-    states = [before(memory, float(t))["state"]["/battery_state"] for t in (20, 55)]
-    assert states == ["4%", "1%"]
-
-
-def test_a_fraction_after_an_update_is_no_percent(tmp_path: Path) -> None:
-    percents = [battery(at(t), 84.0) for t in range(30)]
-    fractions = [battery(at(t), 0.83) for t in range(30, 60)]
-    memory = remembered(tmp_path, [*percents, *fractions, boolean(at(59), True)])
-    assert before(memory, 55.0)["state"]["/battery_state"] == "83%"
+@pytest.mark.parametrize(
+    ("charge", "states"),
+    [
+        (lambda t: max(6 - t * 0.1, 0.8), {20: "4%", 55: "1%"}),
+        (lambda t: 84.0 if t < 30 else 0.83, {55: "83%"}),
+    ],
+    ids=["the last percent is no full one", "a fraction after an update is no percent"],
+)
+def test_the_state_of_a_battery_is_its_charge_in_percent(
+    tmp_path: Path, charge: Callable[[int], float], states: dict[int, str], recalls: bool
+) -> None:
+    charges = [battery(at(t), charge(t)) for t in range(60)]
+    memory = remembered(tmp_path, [*charges, boolean(at(59), True)], recalls=recalls)
+    assert {t: before(memory, t)["state"]["/battery_state"] for t in states} == states
 
 
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
@@ -394,28 +395,23 @@ def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Pat
     assert [event["text"] for event in reply["events"]] == ["stood at x 7.00, y 2.00"]
 
 
-@pytest.mark.parametrize("moment", [142, 200])
-def test_of_goals_that_all_ended_before_the_newest_is_the_state(
-    tmp_path: Path, moment: int
+@pytest.mark.parametrize(
+    ("listed", "moments", "state"),
+    [
+        ({10: {1: 4, 2: 4}, 30: {1: 4, 2: 4, 3: 2}, 141: {1: 4, 2: 4, 3: 6}}, (142, 200), "aborted"),
+        ({10: {1: 4}, 40: {1: 4, 2: 2}}, (45, 200), "active"),
+        ({10: {2: 4}, 40: {2: 4, 1: 2}}, (45, 200), "active"),
+    ],
+    ids=["all ended", "the later runs", "the earlier runs"],
+)
+def test_the_state_of_an_action_is_that_of_the_goal_that_runs_or_ended_last(
+    tmp_path: Path, listed: dict[int, dict[int, int]], moments: tuple[int, ...], state: str
 ) -> None:
     """A server lists its goals as it accepted them, for minutes after they ended."""
-    listed = [goals(at(10), {1: 4, 2: 4}), goals(at(30), {1: 4, 2: 4, 3: 2})]
-    listed.append(goals(at(141), {1: 4, 2: 4, 3: 6}))
-    write_mcap(tmp_path / "bag.mcap", [*(odom(at(nth)) for nth in range(250)), *listed])
-    reply = asked(memory_of(tmp_path), "recap", around=at(moment) / S)
-    assert reply["state"]["/drive goal"] == "aborted"
-
-
-@pytest.mark.parametrize("ended", [1, 2])
-def test_a_goal_that_runs_is_the_state_beside_an_older_one_that_stays_listed(
-    tmp_path: Path, ended: int
-) -> None:
-    running = 3 - ended
-    listed = [goals(at(10), {ended: 4}), goals(at(40), {ended: 4, running: 2})]
-    write_mcap(tmp_path / "bag.mcap", [*(odom(at(nth)) for nth in range(250)), *listed])
-    for moment in (45, 200):
-        reply = asked(memory_of(tmp_path), "recap", around=at(moment) / S)
-        assert reply["state"]["/drive goal"] == "active"
+    statuses = [goals(at(second), each) for second, each in listed.items()]
+    memory = remembered(tmp_path, [*(odom(at(nth)) for nth in range(250)), *statuses])
+    for moment in moments:
+        assert before(memory, moment)["state"]["/drive goal"] == state
 
 
 def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_path: Path) -> None:
