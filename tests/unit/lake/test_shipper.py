@@ -1,16 +1,11 @@
 """Each bag comes into the lake once, whatever happens while it is shipped."""
 
 import errno
-import json
 import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from http.server import BaseHTTPRequestHandler
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -18,11 +13,8 @@ from unittest.mock import Mock
 from urllib.request import Request, urlopen
 
 import pytest
-from pyiceberg.catalog.rest import CreateTableRequest
 from pyiceberg.catalog.sql import SqlCatalog
-from pyiceberg.exceptions import CommitFailedException, NoSuchTableError
 from pyiceberg.manifest import ManifestEntry
-from pyiceberg.table import CommitTableRequest
 from pyiceberg.table.update.snapshot import _OverwriteFiles
 
 from ros2_memory.bag_dir.layout import SHIPPED_FILE
@@ -33,12 +25,13 @@ from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake import shipper as shipper_module
+from ros2_memory.lake import warehouse
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.rows import RowMaker, sha256_of
 from ros2_memory.lake.shipper import Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
-from ros2_memory.lake.warehouse import LakeLocation
+from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation
 from tests.support.bags import Msg, detections, make, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import LONG
@@ -55,7 +48,7 @@ from tests.support.lakes import (
     shipping,
     write_bag,
 )
-from tests.support.processes import http_server, until
+from tests.support.processes import until
 
 ROBOTS = ("hall", "kitchen")
 BAGS = 3
@@ -398,11 +391,22 @@ def test_a_lake_goes_on_where_an_older_version_put_it(tmp_path: Path) -> None:
     assert [*(tmp_path / "usb%20disk").rglob("*.parquet")]
 
 
-def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path) -> None:
-    with rest_catalogue(tmp_path / "lake") as uri:
-        where = replace(location(tmp_path / "lake"), catalog="rest", uri=uri)
-        ship_and_ask(where, tmp_path / "hall")
-        assert where.last_change() is not None
+def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In place of the service is a database that lies elsewhere."""
+    given: list[dict[str, str]] = []
+
+    def service(name: str, **properties: str) -> SqlCatalog:
+        given.append(properties)
+        return SqlCatalog(name, **{**properties, "uri": f"sqlite:///{tmp_path}/service.sqlite"})
+
+    monkeypatch.setattr(warehouse, "RestCatalog", service)
+    where = replace(location(tmp_path / "lake"), catalog="rest", uri="https://catalogue/")
+    ship_and_ask(where, tmp_path / "hall")
+    assert where.last_change() is not None
+    assert {properties["uri"] for properties in given} == {where.uri}
+    assert not (where.state_dir / CATALOGUE_FILE).exists()
 
 
 @pytest.mark.skipif(not LONG, reason="starts an S3 server: EPISODIC_LONG=1")
@@ -442,90 +446,6 @@ def test_bags_are_shipped_once_into_a_bucket_asked_and_forgotten(tmp_path: Path)
         assert not any(secret.encode() in each.read_bytes() for each in kept)
     finally:
         server.stop()
-
-
-class _Requests(BaseHTTPRequestHandler):
-    """Answers requests below `/v1`."""
-
-    def __init__(self, catalog: SqlCatalog, lock: threading.Lock, *given: object) -> None:
-        self._catalog, self._lock = catalog, lock
-        super().__init__(*given)  # type: ignore[arg-type]  # as the server calls it
-
-    def log_message(self, *_: object) -> None:
-        """Logs nothing."""
-
-    def do_GET(self) -> None:
-        status = 404
-        content: object = {"error": {"message": "none", "type": "NoSuch", "code": status}}
-        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        try:
-            with self._lock:
-                status, content = self._answer(body) or (status, content)
-        except NoSuchTableError:
-            pass
-        except CommitFailedException as error:
-            status = 409
-            content = {"error": {"message": str(error), "type": "Conflict", "code": status}}
-        data = json.dumps(content).encode()
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-    def do_POST(self) -> None:
-        self.do_GET()
-
-    def _answer(self, body: bytes) -> tuple[int, object] | None:
-        catalog, parts = self._catalog, self.path.partition("?")[0].split("/")[2:]
-        found: tuple[int, object] | None = None
-        match self.command, *parts:
-            case "GET", "config":
-                found = 200, {"defaults": {}, "overrides": {}}
-            case "GET", "namespaces", name if (name,) in catalog.list_namespaces():
-                found = 200, {"namespace": [name], "properties": {}}
-            case "POST", "namespaces":
-                asked = json.loads(body)["namespace"]
-                is_new = tuple(asked) not in catalog.list_namespaces()
-                catalog.create_namespace_if_not_exists(tuple(asked))
-                found = 200 if is_new else 409, {"namespace": asked}
-            case "POST", "namespaces", name, "tables":
-                new = CreateTableRequest.model_validate({"location": None, **json.loads(body)})
-                assert new.partition_spec is not None
-                assert new.write_order is not None
-                catalog.create_table(
-                    f"{name}.{new.name}",
-                    new.table_schema,
-                    partition_spec=new.partition_spec,
-                    sort_order=new.write_order,
-                    properties=new.properties,
-                )
-                found = self._table(f"{name}.{new.name}")
-            case "POST", "namespaces", name, "tables", known:
-                commit = CommitTableRequest.model_validate_json(body)
-                table = catalog.load_table(f"{name}.{known}")
-                catalog.commit_table(table, commit.requirements, commit.updates)
-                found = self._table(f"{name}.{known}")
-            case "GET", "namespaces", name, "tables", known:
-                found = self._table(f"{name}.{known}")
-        return found
-
-    def _table(self, name: str) -> tuple[int, object]:
-        table = self._catalog.load_table(name)
-        metadata = json.loads(table.metadata.model_dump_json())
-        return 200, {"metadata-location": table.metadata_location, "metadata": metadata}
-
-
-@contextmanager
-def rest_catalogue(folder: Path) -> Iterator[str]:
-    """Serves a catalogue whose tables lie below a folder; yields its address."""
-    folder.mkdir(parents=True, exist_ok=True)
-    catalog = SqlCatalog("rest", uri=f"sqlite:///{folder}/rest.sqlite", warehouse=folder.as_uri())
-    answers = partial(_Requests, catalog, threading.Lock())
-    try:
-        with http_server(answers) as address:
-            yield address
-    finally:
-        catalog.close()
 
 
 def ship_and_ask(where: LakeLocation, folder: Path) -> None:
