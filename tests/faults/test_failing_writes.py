@@ -2,9 +2,6 @@
 
 import errno
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,17 +12,7 @@ from ros2_memory.columns.fill import Progress
 from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import fill_up, plainly, served, store_of, told, write_bags
 from tests.support.column_worlds import store_file
-
-
-@contextmanager
-def no_file_grows_beyond(size: int) -> Iterator[None]:
-    """Writes fail in the kernel, as SQLite's own do, which it takes for a fault of the disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+from tests.support.fakes import files_limited_to
 
 
 @pytest.mark.parametrize("size", [4096, 20_000])
@@ -38,7 +25,7 @@ def test_a_store_that_cannot_be_written_costs_no_answer_and_is_filled_later(
     fill_up(filler)
     write_bags(tmp_path, 3, first=3)
     right = plainly(tmp_path, count=6)
-    with no_file_grows_beyond(size), structlog.testing.capture_logs() as logs:
+    with files_limited_to(size), structlog.testing.capture_logs() as logs:
         for _ in range(3):
             fill_up(filler)
         assert "cannot be used" in (store_of(filler).trouble or "")

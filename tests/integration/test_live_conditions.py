@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.live_recorder import (
     NS_PER_S,
     Machine,
@@ -63,7 +64,7 @@ def as_nobody() -> list[str]:
 
 
 HZ = 20.0
-DISK_BYTES = 8_000_000
+DISK_SIZE = "8m"
 TOLD_WITHIN_S = 10.0
 HEARD = {"/odom", "/bumper", "/clock"}
 
@@ -84,38 +85,14 @@ def robot(site: Machine) -> Iterator[Robot]:
         yield robot
 
 
-@contextmanager
-def small_disk(at: Path) -> Iterator[Path]:
-    at.mkdir()
-    option = f"size={DISK_BYTES}"
-    mount = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(at)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("this user may not mount a small disk")
-    try:
-        yield at
-    finally:
-        subprocess.run(["umount", "--lazy", str(at)], check=True)
-
-
-def fill(disk: Path) -> Path:
-    """The file that takes all that was left."""
-    ballast = disk / "ballast"
-    with ballast.open("wb", buffering=0) as stream:
-        try:
-            while stream.write(bytes(4096)):
-                pass
-        except OSError:
-            return ballast
-    raise AssertionError("the disk did not fill up")
-
-
+@needs_mounts
 @pytest.mark.parametrize("least", ["0.001", "0"])
 @each_in_time
 def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_room(
     site: Machine, robot: Robot, tmp_path: Path, least: str
 ) -> None:
     guarded = least != "0"
-    with small_disk(tmp_path / "disk") as disk:
+    with small_disk(tmp_path / "disk", DISK_SIZE) as disk:
         recorder = site.record(
             f"full{least}{tmp_path.name}",
             "recording.split_duration_s=1",
@@ -125,16 +102,15 @@ def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_roo
         try:
             recorder.wait_for("split_closed")
             full_at = time.time_ns()
-            ballast = fill(disk)
+            with filled(disk):
 
-            def errors() -> list[dict[str, Any]]:
-                return [event for event in recorder.all_events() if event["level"] == "error"]
+                def errors() -> list[dict[str, Any]]:
+                    return [event for event in recorder.all_events() if event["level"] == "error"]
 
-            until(lambda: errors() or None, "an error event", alive=recorder.process)
-            assert moment_of(errors()[0]) - full_at <= TOLD_WITHIN_S * NS_PER_S
-            if guarded:
-                recorder.wait_for("recording_paused")
-            ballast.unlink()
+                until(lambda: errors() or None, "an error event", alive=recorder.process)
+                assert moment_of(errors()[0]) - full_at <= TOLD_WITHIN_S * NS_PER_S
+                if guarded:
+                    recorder.wait_for("recording_paused")
             room_at = time.time_ns()
             if guarded:
                 recorder.wait_for("recording_resumed")
