@@ -42,6 +42,7 @@ from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import detections, odom, write_mcap, write_splits
 from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
+from tests.unit.analysis.motion.posed import off_line
 from tests.unit.test_positions import fix
 
 S = NS_PER_S
@@ -393,18 +394,6 @@ def test_what_was_seen_has_each_label_once_however_often_another_one_was(tmp_pat
     assert rows == [("person", 0, 14), ("cup", 1826, 1827)]
 
 
-def off_line(path: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far each point is from the nearest line that is drawn."""
-    x, y = np.array(path["x"]), np.array(path["y"])
-    to = np.setdiff1d(np.arange(1, len(x)), path["begins"])
-    ax, ay, dx, dy = x[to - 1], y[to - 1], x[to] - x[to - 1], y[to] - y[to - 1]
-    share = (points[:, :1] - ax) * dx + (points[:, 1:] - ay) * dy
-    share = (share / np.maximum(dx * dx + dy * dy, 1e-12)).clip(0, 1)
-    away = np.hypot(points[:, :1] - ax - dx * share, points[:, 1:] - ay - dy * share)
-    nearest: NDArray[np.float64] = away.min(axis=1)
-    return nearest
-
-
 def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -417,7 +406,8 @@ def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
     assert 100 < len(found["x"]) <= 400
-    assert off_line(found, poses).max() <= 0.004
+    drawn = np.column_stack([found["x"], found["y"]])
+    assert off_line(drawn, poses, found["begins"]).max() <= 0.004
 
 
 paths = st.lists(

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
@@ -59,3 +60,16 @@ def stood_in(
     ]
     drops = [drop for stand in stands for drop in stand.drops]
     return standstills_of([each.blocks for each in stands]), drops
+
+
+def off_line(
+    path: NDArray[np.float64], points: NDArray[np.float64], begins: Iterable[int] = ()
+) -> NDArray[np.float64]:
+    """How far each point is from the nearest line of a path; none leads to what `begins` anew."""
+    to = np.setdiff1d(np.arange(len(path)), [*begins])
+    starts = path[np.maximum(to - 1, 0)]
+    ways, offs = path[to] - starts, points[:, None] - starts
+    shares = (offs * ways).sum(axis=2) / np.maximum((ways * ways).sum(axis=1), 1e-300)
+    away = offs - shares.clip(0, 1)[..., None] * ways
+    nearest: NDArray[np.float64] = np.linalg.norm(away, axis=2).min(axis=1)
+    return nearest

@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.model import Vector3
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
 from tests.support.strategies import points
-from tests.unit.analysis.motion.posed import posed, way_of
+from tests.unit.analysis.motion.posed import off_line, posed, way_of
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -86,26 +85,14 @@ def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
     assert len(found.totals.resets) == 1
 
 
-def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
-    """Distance from the polyline, written independently of the code under test."""
-    vertices = np.array([waypoint.position for waypoint in found.waypoints])
-    starts, ways = vertices[:-1], np.diff(vertices, axis=0)
-    squared = np.maximum((ways * ways).sum(axis=1), 1e-300)
-    worst = 0.0
-    for p in np.array([*positions]):
-        ratios = np.clip(((p - starts) * ways).sum(axis=1) / squared, 0.0, 1.0)
-        ends = np.concatenate((starts + ratios[:, None] * ways, vertices))
-        worst = max(worst, float(np.linalg.norm(ends - p, axis=1).min()))
-    return worst
-
-
 @given(st.lists(points, min_size=1, max_size=60), st.integers(2, 60))
 def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     positions: list[Vector3], at_most: int
 ) -> None:
     poses = driven(positions)
     found = way_of(poses, 10.0).trajectory(at_most)
-    assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
+    way = np.array([each.position for each in found.waypoints])
+    assert off_line(way, np.array(positions)).max() <= found.waypoint_error_m + 1e-7
     assert len(found.waypoints) <= at_most
     assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.totals.jumps
     # They are recorded poses, from the first to the last.
