@@ -1,6 +1,3 @@
-from bisect import bisect_left
-from itertools import pairwise
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,6 +10,7 @@ from ros2_memory.analysis.intervals import (
     united_tables,
     visible_in,
 )
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S
 
 Messages = list[tuple[int, dict[str, float | None]]]
@@ -90,25 +88,12 @@ def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: 
 def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
     topics: list[Messages],
 ) -> None:
-    each = [watched(messages) for messages in topics]
-    together = united_tables(each)
-    spans = [one for seen in each for one in seen.intervals()]
-    for interval in together.intervals():
-        mine = [
-            one
-            for one in spans
-            if one.label == interval.label
-            and interval.first <= one.first
-            and one.last <= interval.last
-        ]
-        assert (min(one.first for one in mine), max(one.last for one in mine)) == interval[1:3]
-        mine.sort(key=lambda one: one.first)
-        for nth in range(1, len(mine)):
-            assert mine[nth].first - max(one.last for one in mine[:nth]) <= FLICKER_NS
+    seen = [watched(messages) for messages in topics]
+    every = [interval for table in seen for interval in table.intervals()]
+    together = [*united_tables(seen).intervals()]
     for label in "abc":
-        own = [one for one in together.intervals() if one.label == label]
-        assert all(after.first - before.last > FLICKER_NS for before, after in pairwise(own))
-        inside = [one for one in spans if one.label == label]
-        for one in inside:
-            at = bisect_left([other.last for other in own], one.last)
-            assert own[at].first <= one.first
+        found, spans = (
+            [(each.first, each.last) for each in some if each.label == label]
+            for some in (together, every)
+        )
+        assert found == united(spans, FLICKER_NS)
