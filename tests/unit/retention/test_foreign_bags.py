@@ -44,7 +44,6 @@ from tests.support.program import Program, exits
 from tests.support.simulated_recorders import events
 
 __all__ = ["exits"]
-LITTLE = 1
 
 
 def bytes_of(paths: Iterable[Path]) -> int:
@@ -85,15 +84,6 @@ def mixed(tmp_path: Path) -> Mixed:
     )
     (tmp_path / "session_mcap" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     return tmp_path, mine, others
-
-
-def test_no_limit_takes_a_foreign_bag(mixed: Mixed) -> None:
-    bag_dir, mine, others = mixed
-    for limits in ({"max_bytes": LITTLE}, {"max_age_h": 0.01}):
-        for _ in range(3):
-            careful(bag_dir, **limits).apply()
-    assert all(path.exists() for path in others)
-    assert [path for path in mine if path.exists()] == mine[-1:]
 
 
 def test_the_budget_counts_the_recorders_own_and_moments_alone(mixed: Mixed) -> None:
@@ -177,21 +167,6 @@ def test_a_repair_neither_rewrites_nor_removes_another_programs_bag(tmp_path: Pa
     house.apply()
     assert cut.read_bytes() != before
     assert not empty.exists()
-
-
-def test_a_start_that_clears_leaves_foreign_bags(mixed: Mixed) -> None:
-    bag_dir, mine, others = mixed
-    kept(careful(bag_dir), bag_dir, 0, 15)
-    assert in_moments(bag_dir)
-    wiped = clear_bags(bag_dir, OwnRecordings(bag_dir))
-    assert wiped.faults == []
-    assert not any(path.exists() for path in mine)
-    assert all(path.exists() for path in others)
-    assert (bag_dir / "session_mcap" / "metadata.yaml").exists()
-    assert not (bag_dir / "moments").exists()
-    assert not (bag_dir / B).exists()
-    clear_bags(bag_dir)
-    assert not any(path.exists() for path in others)
 
 
 def test_of_moments_those_bags_go_that_were_saved(tmp_path: Path) -> None:
