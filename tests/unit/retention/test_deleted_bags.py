@@ -165,21 +165,6 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
     assert deleted_spans(tmp_path) == ((T0, T0 + 89 * S + 1),)
 
 
-def test_the_list_stays_short_however_long_the_robot_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 4_000)
-    (tmp_path / "here").mkdir()
-    append_deleted(tmp_path, [deleted_of("here", [("here_0.mcap", T0 - 50 * S, T0 - 40 * S)])])
-    for n in range(200):
-        name = f"rec_{n // 30}"
-        at = T0 + n * 10 * S + (500 * S if n >= 140 else 0)
-        append_deleted(tmp_path, [deleted_of(name, [(f"{name}_{n}.mcap", at, at + 9 * S)])])
-    assert (tmp_path / DELETED_FILE).stat().st_size < 4_500
-    assert read_deleted(tmp_path)["here"].files == ("here_0.mcap",)
-    assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [-50, 0, 1900]
-
-
 def test_times_of_files_that_the_list_has_no_room_for_are_known_as_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,14 +40,6 @@ def folders(bag_dir: Path, *names: str) -> None:
         (bag_dir / name).mkdir()
 
 
-def test_it_is_written_once_a_minute_so_that_a_kill_forgets_no_more(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    end = recorded(RecordedTime(tmp_path), "a", 119)
-    assert [row.recorded_s for row in RECORDED.rows(tmp_path)] == [0, 60]
-    recorded(RecordedTime(tmp_path), "b", 119, since_s=end)
-    assert RecordedTime(tmp_path).since(["a"]) == {"a": 60 * S}
-
-
 def test_recordings_that_are_gone_are_dropped_without_a_restart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
