@@ -156,18 +156,6 @@ def test_what_holds_at_the_end_holds_after_a_restart(tmp_path: Path) -> None:
     assert bags.seconds() == [0.5, *halves(33, 40)]
 
 
-def test_latched_messages_from_before_stay(bags: ScreenedBags) -> None:
-    old, maps = bags.begin(0), [word(1, "/map"), word(6, "/map")]
-    bags.split(old, [off(0), on(5), *maps, *words(0, 10)])
-    new = bags.begin(10)
-    bags.end(old)
-    again = [replace(each, log_time=T0 + 11 * S, publish_time=each.log_time) for each in maps]
-    bags.split(new, [*again, on(11, published=5), *words(11, 20)])
-    bags.end()
-    # Before the first second nothing was known.
-    assert bags.seconds("/map") == [1.0, 11.0]
-
-
 def test_a_latched_message_that_was_excluded_long_ago_does_not_come_back(
     bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
