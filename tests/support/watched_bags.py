@@ -1,6 +1,6 @@
 """A bag directory that a recorder of ours fills split by split, and a watch of rules over it."""
 
-from collections.abc import Iterable, MutableMapping, Sequence
+from collections.abc import Collection, Iterable, MutableMapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,10 @@ RESTART: dict[str, Any] = {"kind": "recorder_restart", "topic": None, "condition
 
 def flag(second: float, value: bool, topic: str = "/bumper") -> Msg:
     return boolean(T0 + round(second * S), value, topic)
+
+
+def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
+    return [flag(n, n in true_at) for n in range(begin, stop)]
 
 
 class WatchedBags:
@@ -138,7 +142,18 @@ class WatchedBags:
         (self.bag_dir / new).mkdir(exist_ok=True)
         write_handover(self.bag_dir / new, Handover(previous=old, counts_from=cut, begin=begin))
 
-    def look(self) -> None:
+    def drive(self, stop: int, true_at: Collection[int] = (), *, first: int = 0) -> list[Path]:
+        """Ten seconds of `/bumper` in each split, which is looked at as soon as it is closed."""
+        paths = []
+        for begin in range(first, stop, 10):
+            paths.append(self.split(seconds(begin, begin + 10, true_at)))
+            self.look()
+        return paths
+
+    def look(self, at: int | None = None) -> None:
+        """Has what is there looked at, now or so many seconds after `T0`."""
+        if at is not None:
+            self.clock.at = T0 + at * S
         with structlog.testing.capture_logs() as log:
             self.house.apply()
         self.log += log
@@ -150,10 +165,10 @@ class WatchedBags:
         """When rules fired, in order."""
         return sorted(each["at_ns"] for each in self.logged("trigger_fired"))
 
-    def close_all(self) -> None:
+    def close_all(self, at: int | None = None) -> None:
         """Ends what is being written, and has it looked at."""
         self.beat(state=RecorderState.STOPPED)
-        self.look()
+        self.look(at)
 
     def record(self, name: str = "bumper") -> RuleRecord:
         state = TRIGGERS.read(self.bag_dir)

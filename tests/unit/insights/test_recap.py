@@ -398,7 +398,11 @@ def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Pat
 @pytest.mark.parametrize(
     ("listed", "moments", "state"),
     [
-        ({10: {1: 4, 2: 4}, 30: {1: 4, 2: 4, 3: 2}, 141: {1: 4, 2: 4, 3: 6}}, (142, 200), "aborted"),
+        (
+            {10: {1: 4, 2: 4}, 30: {1: 4, 2: 4, 3: 2}, 141: {1: 4, 2: 4, 3: 6}},
+            (142, 200),
+            "aborted",
+        ),
         ({10: {1: 4}, 40: {1: 4, 2: 2}}, (45, 200), "active"),
         ({10: {2: 4}, 40: {2: 4, 1: 2}}, (45, 200), "active"),
     ],

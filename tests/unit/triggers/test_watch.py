@@ -2,7 +2,6 @@
 
 import errno
 import os
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from ros2_memory.triggers.rules import Rule
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.fakes import broken
 from tests.support.noting_reader import fail_reading
-from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
+from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule, seconds
 
 LATCHED = McapLayout(latched=frozenset({"/bumper"}))
 
@@ -41,15 +40,10 @@ def fail_to_summarize(monkeypatch: pytest.MonkeyPatch, *bags: Path) -> None:
     fail_reading(monkeypatch, "summarize", faults.get)
 
 
-def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
-    return [flag(n, n in true_at) for n in range(begin, stop)]
-
-
 def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
     robot.begin(T0)
     robot.split(seconds(0, 8, {1, 7}))
-    robot.clock.at = T0 + 60 * S
-    robot.close_all()
+    robot.close_all(60)
     [moment] = robot.moments()
     assert (robot.spans(), moment.moment.matches) == ([(-4, 10)], 2)
     missing = [each.partition(" from ")[0] for each in moment.moment.missing]
@@ -58,12 +52,10 @@ def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
 
 def test_a_later_match_extends_a_moment_that_is_stored(robot: WatchedBags) -> None:
     robot.begin(T0)
-    robot.split(seconds(0, 10, {6}))
-    robot.look()
+    robot.drive(10, {6})
     robot.split(seconds(10, 20, {11}))
     robot.split(seconds(20, 30))
-    robot.clock.at = T0 + 30 * S
-    robot.look()
+    robot.look(30)
     assert robot.spans() == [(1, 14)]
     [moment] = robot.moments()
     assert (moment.moment.matches, len(moment.files), moment.moment.pending) == (2, 2, False)
@@ -200,8 +192,7 @@ def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
         doors = [flag(begin + n + 0.5, begin + n == 95, "/door") for n in range(10)]
         robot.split([*seconds(begin, begin + 10, range(5, 100, 10)), *doors])
         robot.look()
-    robot.clock.at = T0 + 200 * S
-    robot.close_all()
+    robot.close_all(200)
     one, other = robot.record("noisy"), robot.record("quiet")
     assert (one.fired, other.fired) == (10, 1)
     assert 0 < one.moments < 10
@@ -216,9 +207,7 @@ def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
 def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=0, after=0, max_per_hour=3))
     robot.begin(T0)
-    for begin in range(0, 60, 10):
-        robot.split(seconds(begin, begin + 10, range(0, 60, 2)))
-        robot.look()
+    robot.drive(60, range(0, 60, 2))
     robot.close_all()
     record = robot.record()
     assert (record.fired, record.moments, record.refused) == (30, 3, 27)
@@ -229,9 +218,7 @@ def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
 def test_moments_that_are_refused_for_their_size_do_not_count_in_the_hour(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(max_bytes=1, max_per_hour=2))
     robot.begin(T0)
-    for begin in range(0, 100, 10):
-        robot.split(seconds(begin, begin + 10, {5, 35, 65, 95}))
-        robot.look()
+    robot.drive(100, {5, 35, 65, 95})
     robot.close_all()
     record = robot.record()
     assert (record.fired, record.moments, record.refused) == (4, 0, 4)
@@ -251,9 +238,8 @@ def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> No
 def test_age_deletes_nothing_that_a_rule_may_need(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=50 * S), max_age_h=20 / 3600)
     robot.begin(T0)
-    splits = [robot.split(seconds(begin, begin + 10)) for begin in range(0, 100, 10)]
-    robot.clock.at = T0 + 100 * S
-    robot.look()
+    splits = robot.drive(100)
+    robot.look(100)
     robot.look()
     # Until 98 s everything was searched, and 50 s before that may be needed.
     assert [each.exists() for each in splits] == [False] * 4 + [True] * 6
@@ -265,8 +251,7 @@ def test_a_match_that_takes_long_keeps_the_bags_in_which_it_began(tmp_path: Path
     robot.begin(T0)
     for begin in range(0, 100, 10):
         robot.split(seconds(begin, begin + 10, range(20, 100)))
-        robot.clock.at = T0 + (begin + 10) * S
-        robot.look()
+        robot.look(begin + 10)
     robot.close_all()
     assert robot.spans() == [(18, 83)]
     assert [len(moment.files) for moment in robot.moments()] == [8]
@@ -275,9 +260,7 @@ def test_a_match_that_takes_long_keeps_the_bags_in_which_it_began(tmp_path: Path
 def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=3600 * S), max_bytes=10_000)
     robot.begin(T0)
-    for begin in range(0, 100, 10):
-        robot.split(seconds(begin, begin + 10))
-    robot.look()
+    robot.drive(100)
     robot.look()
     assert robot.logged("needed_bags_deleted")
     assert "were deleted to make room" in (robot.record().problem or "")
@@ -287,8 +270,7 @@ def test_a_name_that_is_no_utf8_stops_neither_rules_nor_deletion(tmp_path: Path)
     robot = watched(tmp_path, max_bytes=1)
     for begin in range(0, 100, 10):
         robot.split(seconds(begin, begin + 10, {92}), os.fsdecode(b"caf\xe9"))
-    robot.clock.at = T0 + 110 * S
-    robot.close_all()
+    robot.close_all(110)
     assert robot.spans() == [(87, 95)]
     assert len([*robot.bag_dir.glob("caf*/*")]) == 2  # those of the moment
 
@@ -298,18 +280,13 @@ def test_what_happens_after_the_clock_was_set_back_fires_once(
     robot: WatchedBags, back: int
 ) -> None:
     robot.begin(T0)
-    for begin in range(0, 100, 10):
-        robot.split(seconds(begin, begin + 10, {98}))
-        robot.look()
+    robot.drive(100, {98})
     begin = 100 - back
-    robot.split(seconds(begin, begin + 10))
-    robot.look()
+    robot.drive(begin + 10, first=begin)
     robot.house = robot.new_house()
     # A match across two splits, and one when the clock has caught up.
     held = [*range(begin + 15, begin + 25), 131]
-    for start in range(begin + 10, 140, 10):
-        robot.split(seconds(start, start + 10, held))
-        robot.look()
+    robot.drive(140, held, first=begin + 10)
     robot.close_all()
     assert [(at - T0) // S for at in robot.fired_at()] == sorted([98, begin + 15, 131])
 
@@ -333,18 +310,15 @@ def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot.begin(T0)
-    robot.split(seconds(0, 10))
-    robot.look()
+    robot.drive(10)
     bad = robot.split(seconds(10, 20, {15}))
     with monkeypatch.context() as failing:
         fail_to_summarize(failing, bad)
         for begin in (20, 30, 40):
             robot.split(seconds(begin, begin + 10, {begin + 2}))
-            robot.clock.at = T0 + (begin + 10) * S
-            robot.look()
+            robot.look(begin + 10)
         assert bad.name in (robot.problem() or "")
-    robot.clock.at = T0 + 300 * S
-    robot.close_all()
+    robot.close_all(300)
     assert [(at - T0) // S for at in robot.fired_at()] == [15, 22, 32, 42]
 
 
@@ -353,25 +327,21 @@ def test_a_split_that_cannot_be_read_is_a_problem_only_until_it_can_be(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch, is_restarted: bool
 ) -> None:
     robot.begin(T0)
-    robot.split(seconds(0, 10))
-    robot.look()
+    robot.drive(10)
     with monkeypatch.context() as failing:
         first = robot.split(seconds(10, 20))
         second = robot.split([])  # it has no message, which shows only once it can be read
         fail_to_summarize(failing, first, second)
         robot.split(seconds(30, 40))
-        robot.clock.at = T0 + 40 * S
-        robot.look()
+        robot.look(40)
         assert first.name in (robot.problem() or "")
     with monkeypatch.context() as failing:
         fail_to_summarize(failing, second)
-        robot.clock.at = T0 + 300 * S
-        robot.look()
+        robot.look(300)
         assert second.name in (robot.problem() or "")
     if is_restarted:
         robot.house = robot.new_house()
-    robot.clock.at = T0 + 600 * S
-    robot.look()
+    robot.look(600)
     assert robot.problem() is None
 
 
@@ -379,19 +349,16 @@ def test_a_split_that_was_deleted_before_it_could_be_read_stays_a_problem(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot.begin(T0)
-    robot.split(seconds(0, 10))
-    robot.look()
+    robot.drive(10)
     lost = robot.split(seconds(10, 20, {15}))
     fail_to_summarize(monkeypatch, lost)
     robot.split(seconds(20, 30))
-    robot.clock.at = T0 + 30 * S
-    robot.look()
+    robot.look(30)
     lost.unlink()
     other = robot.split(seconds(30, 40))
     fail_to_summarize(monkeypatch, other)
     robot.split(seconds(40, 50))
-    robot.clock.at = T0 + 60 * S
-    robot.look()
+    robot.look(60)
     said = robot.problem() or ""
     assert (lost.name in said, other.name in said) == (True, True)
 
@@ -405,20 +372,17 @@ def test_a_first_split_that_is_readable_late_is_searched_then(
         fail_to_summarize(failing, first)
         robot.split(seconds(10, 20, {12}))
         robot.split(seconds(20, 30))
-        robot.clock.at = T0 + 30 * S
-        robot.look()
+        robot.look(30)
         assert robot.fired_at() == [T0 + 12 * S]
         assert first.name in (robot.problem() or "")
-    robot.clock.at = T0 + 300 * S
-    robot.close_all()
+    robot.close_all(300)
     assert [(at - T0) // S for at in robot.fired_at()] == [5, 12]
     assert robot.problem() is None
 
 
 def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> None:
     robot.begin(T0)
-    paths = [robot.split(seconds(begin, begin + 10, {25})) for begin in range(0, 50, 10)]
-    robot.look()
+    paths = robot.drive(50, {25})
     paths[1].unlink()
     robot.split(seconds(50, 60))
     robot.close_all()
