@@ -141,6 +141,11 @@ class Rows:
         """The positions of the table's rows that count, ascending; None if all do."""
         return self.find()
 
+    @property
+    def positions(self) -> IntArray:
+        """The positions of the table's rows that count, ascending, also if all do."""
+        return np.arange(len(self.table)) if self.index is None else self.index
+
     def __len__(self) -> int:
         """Returns how many rows count."""
         return len(self.table) if self.index is None else self.index.size
@@ -216,8 +221,7 @@ class Rows:
     @property
     def ranks(self) -> IntArray:
         """How many rows with the same bag and log time precede each row that counts."""
-        times, numbers = self.unit.times(), self.unit.bag_numbers()
-        index = np.arange(times.size) if self.index is None else self.index
+        times, numbers, index = self.unit.times(), self.unit.bag_numbers(), self.positions
         # Rows of one log time follow each other: those of other times are not looked at.
         begin, end = 0, 0
         if index.size:
@@ -233,15 +237,12 @@ class Rows:
 
     def some(self, positions: IntArray) -> Rows:
         """Returns the rows at some ascending positions among those that count."""
-        index = positions if self.index is None else self.index[positions]
-        return Rows.of(self.unit, index)
+        return Rows.of(self.unit, self.positions[positions])
 
     def mask(self) -> Flags:
         """Returns for each row of the table whether it counts."""
-        if self.index is None:
-            return np.ones(len(self.table), np.bool_)
         mask = np.zeros(len(self.table), np.bool_)
-        mask[self.index] = True
+        mask[self.positions] = True
         return mask
 
 

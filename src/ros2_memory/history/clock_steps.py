@@ -249,7 +249,7 @@ def _stamps_by_recording(view: View, topic: str, window: TimeWindow) -> dict[Pat
         if column is None or isinstance(column, Texts):
             return None
         stamps = np.asarray(column, np.int64)
-        return np.stack((rows.times, stamps if rows.index is None else stamps[rows.index]))
+        return np.stack((rows.times, stamps[rows.positions]))
 
     for rows in scan(view, topic, window, may_match=may_match):
         by_recording[rows.recording] += of_columns(view, rows, read_stamps) or []

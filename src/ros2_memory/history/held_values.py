@@ -295,7 +295,7 @@ class HeldValues:
         words = words_of(rows.table, self._field, self._view.extractor)
         if words is None:
             return None
-        return rows.times, words if rows.index is None else words[rows.index]
+        return rows.times, words[rows.positions]
 
     def _runs_of_messages(
         self, block: Sequence[Rows], window: TimeWindow, *, newest_first: bool

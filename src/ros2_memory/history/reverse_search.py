@@ -123,7 +123,7 @@ class RowCondition:
         unstated = self._test.unstated(rows.table)
         if unstated is not None:
             return unstated
-        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        index = rows.positions
         unstated = np.zeros(len(rows.table), np.bool_)
         for positions, decoded in decoded_rows(self._view, rows):
             of_bag = self._test.unstated(decoded.table)
@@ -140,7 +140,7 @@ class RowCondition:
         is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
         if not is_stored or channel.type in self._left_to_messages or truth.is_settled:
             return truth
-        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        index = rows.positions
         unsure = np.flatnonzero(truth.unsure[index])
         if unsure.size <= MOST_UNSURE:
             return truth
@@ -257,7 +257,7 @@ class CandidateRows:
         if truth.is_none:
             self.ruled_out = True
             return _NO_TIMES
-        perhaps = truth.perhaps if rows.index is None else truth.perhaps[rows.index]
+        perhaps = truth.perhaps[rows.positions]
         self.ruled_out |= not perhaps.all()
         return rows.times[perhaps]
 
@@ -481,7 +481,7 @@ class ReverseSearch:
 
     def _test_rows(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
         """Tests the rows that count by columns, and reads the messages that columns leave open."""
-        counting = slice(None) if rows.index is None else rows.index
+        counting = rows.positions
         surely, perhaps = truth.surely[counting], truth.perhaps[counting]
         self.ruled_out |= not perhaps.all()
         source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
