@@ -15,10 +15,11 @@ from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
 from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.pack import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
-from ros2_memory.core.arrays import concatenated, distinct, distinct_rows
+from ros2_memory.core.arrays import concatenated, distinct_rows
 from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
+    from ros2_memory.columns.units import Rows
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray, Mask
 
@@ -32,26 +33,21 @@ _TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
 _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
 
 
-def edges_in(table: Table, times: IntArray, index: IntArray | None) -> Edges | None:
-    """Returns the transforms in some rows of a table; None if their messages have to be read.
+def edges_in(rows: Rows) -> Edges | None:
+    """Returns the transforms in rows; None if their messages have to be read.
 
     Numbers are rounded as the store rounds them, so that a part and a bag have the same ones.
-
-    Args:
-        table: has the rows.
-        times: the log times (ns) of the rows.
-        index: the positions of the rows in the table, ascending; None for all.
     """
-    transforms = _transforms_of(table)
+    transforms = _transforms_of(rows.table)
     if transforms is None:
         return None
-    read = partial(_edges_of, transforms, times, index)
-    return table.remember("edges", read, _bytes_of) if index is None else read()
+    read = partial(_edges_of, transforms, rows)
+    return rows.table.remember("edges", read, _bytes_of) if rows.index is None else read()
 
 
-def _edges_of(transforms: Elements, times: IntArray, index: IntArray | None) -> Edges:
-    if index is not None:
-        transforms = transforms.rows(index)
+def _edges_of(transforms: Elements, rows: Rows) -> Edges:
+    if rows.index is not None:
+        transforms = transforms.rows(rows.index)
     pairs, codes = _coded_pairs(transforms)
     translation = _rounded_rows(transforms, _TRANSLATION, METRES)
     rotation = _rounded_rows(transforms, _ROTATION, QUATERNION)
@@ -59,14 +55,13 @@ def _edges_of(transforms: Elements, times: IntArray, index: IntArray | None) -> 
     # tf2 refuses what is not finite, and rotations that are not unit quaternions.
     is_valid = (codes >= 0) & np.isfinite(translation).all(axis=1)
     is_valid &= np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
+    log_times = rows.times[transforms.owners]
     edges: dict[Pair, Edge] = {}
     for nth, pair in enumerate(pairs):
-        rows = np.flatnonzero(is_valid & (codes == nth))
-        if rows.size:
-            turned = unit_quaternions(rotation[rows])
-            edges[pair] = Edge(
-                stamps[rows], times[transforms.owners[rows]], translation[rows], turned
-            )
+        of_pair = np.flatnonzero(is_valid & (codes == nth))
+        if of_pair.size:
+            turned = unit_quaternions(rotation[of_pair])
+            edges[pair] = Edge(stamps[of_pair], log_times[of_pair], translation[of_pair], turned)
     return edges
 
 
@@ -74,24 +69,19 @@ def _bytes_of(edges: Edges) -> int:
     return 1000 + sum(500 + 72 * edge.stamps.size for edge in edges.values())
 
 
-def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | None:
-    """Returns the parents and children of the valid transforms in some rows of a table.
+def pairs_in(rows: Rows) -> frozenset[Pair] | None:
+    """Returns the parents and children of the valid transforms in rows.
 
     Returns None if the messages have to be read.
-
-    Args:
-        table: has the rows.
-        index: the positions of the rows, ascending; None for all.
     """
-    transforms = _transforms_of(table)
+    transforms = _transforms_of(rows.table)
     if transforms is None:
         return None
-    if index is None and _has_finite_numbers(table):
+    if rows.index is None and _has_finite_numbers(rows.table):
         pairs, codes = _coded_pairs(transforms)
         counts = np.bincount(codes[_are_rotations(transforms)] + 1, minlength=len(pairs) + 1)
         return frozenset(compress(pairs, counts[1:]))
-    times = np.zeros(len(table) if index is None else index.size, np.int64)
-    return frozenset(_edges_of(transforms, times, index))
+    return frozenset(_edges_of(transforms, rows))
 
 
 def _has_finite_numbers(table: Table) -> bool:
@@ -110,14 +100,14 @@ def _are_rotations(transforms: Elements) -> Mask:
     return are_rotations
 
 
-def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:
-    """Returns the log times (ns) at which a transform differs from the previous one of its child.
+def changing_rows(rows: Rows) -> Rows:
+    """Returns the rows at whose log times a transform differs from the last one of its child.
 
-    Returns None if the messages have to be read. The arguments are as for `edges_in`.
+    Returns all rows if the messages have to be read.
     """
-    edges = edges_in(table, times, index)
+    edges = edges_in(rows)
     if edges is None:
-        return None
+        return rows
     parents = Counter(child for _, child in edges)
     changes: list[IntArray] = []
     for (_, child), edge in edges.items():
@@ -126,7 +116,7 @@ def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntAr
             numbers = np.column_stack((edge.translation, edge.rotation))
             is_new[1:] = (numbers[1:] != numbers[:-1]).any(axis=1)
         changes.append(edge.log_times[is_new])
-    return distinct(concatenated(changes))
+    return rows.some(np.flatnonzero(np.isin(rows.times, concatenated(changes))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,25 +143,17 @@ STATICS: Final[FragmentKind[Statics]] = FragmentKind(
 """The static transforms of a part, exact."""
 
 
-def stamped_between(
-    table: Table, index: IntArray | None, earliest: Ns, latest: Ns
-) -> IntArray | None:
-    """Returns the places in `index` of the rows that have a transform stamped in a span.
+def stamped_between(rows: Rows, earliest: Ns, latest: Ns) -> Rows | None:
+    """Returns the rows that have a transform stamped in a span (ns, inclusive).
 
     Returns None if the messages have to be read.
-
-    Args:
-        table: has the rows.
-        index: the positions of the rows, ascending; None for all.
-        earliest: stamp (ns), inclusive.
-        latest: stamp (ns), inclusive.
     """
-    transforms = _transforms_of(table)
+    transforms = _transforms_of(rows.table)
     if transforms is None:
         return None
     stamps = np.asarray(transforms.columns[_STAMP], np.int64)
-    rows = distinct(transforms.owners[(stamps >= earliest) & (stamps <= latest)])
-    return rows if index is None else np.flatnonzero(np.isin(index, rows))
+    stamped = transforms.owners[(stamps >= earliest) & (stamps <= latest)]
+    return rows.some(np.flatnonzero(np.isin(rows.positions, stamped)))
 
 
 def _transforms_of(table: Table) -> Elements | None:

@@ -20,13 +20,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import proxy
 
-import numpy as np
-
 from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge, without_repeats
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned, recorded_as
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.store import relative
-from ros2_memory.columns.transforms import STATICS, Pair, Statics, pairs_in, static_times
+from ros2_memory.columns.transforms import STATICS, Pair, Statics, changing_rows, pairs_in
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
@@ -427,9 +425,7 @@ class Sessions:
         """Returns the static transforms in rows, without repeats, and remembers those of a part."""
 
         def make() -> Statics:
-            times = static_times(rows.table, rows.times, rows.index)
-            new = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
-            changes = without_repeats(self.received(None, new))
+            changes = without_repeats(self.received(None, changing_rows(rows)))
             return Statics(relative(str(rows.recording), str(self._view.bag_dir)), tuple(changes))
 
         key = None if rows.part is None else FragmentKey(rows.first, "", (rows.part,))
@@ -510,7 +506,7 @@ class Sessions:
         by_columns = None
         with view.bags.watched() as reading:
             if session is None:
-                by_columns = of_columns(view, rows, lambda read: pairs_in(read.table, read.index))
+                by_columns = of_columns(view, rows, pairs_in)
             if by_columns is None:
                 received = self.received(session, rows)
                 by_columns = [frozenset((found.parent, found.child) for found in received)]

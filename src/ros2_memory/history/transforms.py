@@ -7,6 +7,7 @@ to the length of tf2's cache (10 s). A static transform holds however long ago i
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -354,10 +355,7 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
         zones = parts.zone(_STAMPS)
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
-    def select_near(rows: Rows) -> Rows | None:
-        stamped = stamped_between(rows.table, rows.index, earliest, latest)
-        return None if stamped is None else rows.some(stamped)
-
+    select_near = partial(stamped_between, earliest=earliest, latest=latest)
     everything = TimeWindow.everything()
     for topic in view.moving_topics:
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
@@ -374,7 +372,7 @@ def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
         return {}
     tables = None
     if not sessions.holds_carried(rows.recording):
-        tables = of_columns(view, rows, lambda part: edges_in(part.table, part.times, part.index))
+        tables = of_columns(view, rows, edges_in)
     if tables is None:
         return edges_of(sessions.received(session, rows))
     joined = joined_edges(tables)
