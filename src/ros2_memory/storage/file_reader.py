@@ -64,7 +64,7 @@ def has_too_many_objects(definition: Definition, payload: bytes) -> bool:
         return False
     counter = _ObjectCounter(payload)
     with suppress(_StoppedError, struct.error, IndexError):
-        counter.count_message(definition)
+        counter.count(definition, 1)
     return counter.objects > MAX_OBJECTS
 
 
@@ -80,37 +80,28 @@ class _ObjectCounter:
         self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
         self._position = _HEADER_BYTES
 
-    def count_message(self, definition: Definition) -> None:
-        self._add(1)
+    def count(self, kind: str | Definition, elements: int) -> None:
+        if isinstance(kind, str) and kind in _SIZES:
+            if elements:  # without elements there is no padding either
+                self._skip(_SIZES[kind], _SIZES[kind] * elements)
+            return
+        if isinstance(kind, str) and kind != "string":
+            raise _StoppedError
+        self.objects += elements
+        if self.objects > MAX_OBJECTS:
+            raise _StoppedError
+        for _ in range(elements):
+            if isinstance(kind, Definition):
+                self._count_fields(kind)
+            else:
+                self._skip(1, self._read_length())
+
+    def _count_fields(self, definition: Definition) -> None:
         if not definition.fields:
             self._skip(1, 1)  # the dummy byte of an empty message
         for field in definition.fields:
-            if field.length is None:
-                self._count_value(field.kind)
-            else:
-                length = self._read_length() if field.length == SEQUENCE else field.length
-                self._count_elements(field.kind, length)
-
-    def _count_elements(self, kind: str | Definition, count: int) -> None:
-        if isinstance(kind, str) and kind in _SIZES:
-            if count:  # without elements there is no padding either
-                self._skip(_SIZES[kind], _SIZES[kind] * count)
-            return
-        if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
-            self._add(count)
-        for _ in range(count):
-            self._count_value(kind)
-
-    def _count_value(self, kind: str | Definition) -> None:
-        if isinstance(kind, Definition):
-            self.count_message(kind)
-        elif kind == "string":
-            self._add(1)
-            self._skip(1, self._read_length())
-        elif kind in _SIZES:
-            self._skip(_SIZES[kind], _SIZES[kind])
-        else:
-            raise _StoppedError
+            length = self._read_length() if field.length == SEQUENCE else field.length
+            self.count(field.kind, 1 if length is None else length)
 
     def _read_length(self) -> int:
         at = self._skip(_LENGTH_BYTES, _LENGTH_BYTES)
@@ -125,11 +116,6 @@ class _ObjectCounter:
         if self._position > len(self._payload):
             raise _StoppedError
         return begin
-
-    def _add(self, objects: int) -> None:
-        self.objects += objects
-        if self.objects > MAX_OBJECTS:
-            raise _StoppedError
 
 
 _MAX_DECODERS: Final = 10_000
