@@ -12,7 +12,6 @@ from collections import defaultdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, read_listing
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -108,8 +107,8 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
     """Returns what recordings of a snapshot lack; adds what it reads to the `known` listings.
 
     Our recorder deletes splits that metadata.yaml still lists. A split that it noted as deleted is
-    not missing. Nor is one before the first split that is left: older versions deleted the oldest
-    splits without a note.
+    not missing. Nor is one before the first split that is left: of a recording of many splits, it
+    deletes the oldest first, and of too many it keeps no note.
     """
     if not snapshot.metadata_folders:
         return []
@@ -120,7 +119,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
             absent.append(Absent(folder, unreadable=True))
             continue
         # The slowest check of all, needed only if the first file is missing.
-        is_own = bool(listing.first) and _may_delete_splits(own, bag_dir, Path(folder))
+        is_own = bool(listing.first) and _may_be_own(own, Path(folder))
         deletion = deletions.get(folder.removeprefix(f"{bag_dir}/"))
         deleted = frozenset[str]() if deletion is None else frozenset(deletion.files)
         lack = _compare(folder, listing, present[folder], deleted, is_own=is_own)
@@ -171,13 +170,10 @@ def _names(absent: Sequence[Absent]) -> str:
     return listed(names[:MAX_NAMED], len(names))
 
 
-def _may_delete_splits(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
-    """Returns whether our recorder may have deleted splits of a recording without a note."""
+def _may_be_own(own: OwnRecordings, folder: Path) -> bool:
+    """Returns whether our recorder may have made a recording: if not, it deleted no split of it."""
     try:
-        if own.exists():
-            return own.owns(folder)
-        # Versions without a list of own recordings deleted splits of any.
-        return (bag_dir / HEARTBEAT_FILE).exists()
+        return own.owns(folder)
     except OSError:
         return True
 
