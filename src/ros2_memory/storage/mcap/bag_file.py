@@ -74,8 +74,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.mcap.records import Declarations
-
 _LARGE_BYTES: Final = 8 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
@@ -235,28 +233,13 @@ class _Reading:
             return self.index
         chunks = _chunks_to_verify(self.index)
         for group in read_groups(self._file, chunks, self._bags.limit):
+            # What cannot be read is lost, which says nothing about the indexes.
             try:
-                require_declared(group, declared)
-            except UnreadableError:
-                fault = self._first_fault(group.chunks, declared)
-                if fault is not None:
-                    return self._index_without(fault)
+                if group.is_read:
+                    require_declared(group, declared)
+            except UnreadableError as fault:
+                return self._index_without(fault)
         return self.index
-
-    def _first_fault(
-        self, chunks: Sequence[Chunk], declared: Declarations
-    ) -> UnreadableError | None:
-        """Returns how the indexes of a chunk are wrong; None if they are right, or unreadable."""
-        for chunk in chunks:
-            try:
-                content = self._read_chunk(chunk)
-            except UnreadableError:
-                continue  # its messages are lost, which says nothing about the indexes
-            try:
-                require_declared(content, declared)
-            except UnreadableError as error:
-                return error
-        return None
 
     def records(self, *, newest_first: bool) -> Iterator[Record | LostError]:
         """Yields the messages in order, and errors where some are lost."""
@@ -342,7 +325,7 @@ class _Reading:
         self, group: ReadChunks, yielded: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
-        if group.buffer:
+        if group.is_read:
             with suppress(UnreadableError, ValueError, IndexError):
                 messages = read_indexes(group.chunks, group.indexes, self._wanted)
                 batches = self._batches_of(group, messages)

@@ -60,8 +60,8 @@ class ReadChunks(NamedTuple):
 
     Attributes:
         chunks: at least one.
-        buffer: their decompressed records; empty if they cannot be read.
-        sizes: how many bytes of the buffer each chunk has.
+        buffer: their decompressed records.
+        sizes: how many bytes of the buffer each chunk has; empty if they cannot be read.
         indexes: the bytes of the message indexes behind each chunk.
     """
 
@@ -69,6 +69,11 @@ class ReadChunks(NamedTuple):
     buffer: bytes
     sizes: Sequence[int]
     indexes: Sequence[bytes] = ()
+
+    @property
+    def is_read(self) -> bool:
+        """Whether they can be read."""
+        return bool(self.sizes)
 
 
 def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> Iterator[ReadChunks]:
