@@ -793,6 +793,7 @@ class RuleRecord:
         problem: why it may have missed a match, or keeps nothing; None if it works. See also
             `TriggerState.unread`.
         unstored: why moments wait to be stored; None if none waits.
+        never: why it can never fire as things are; None if it can.
         always_since: since when it has matched without an end; None unless that is long.
         begun: the log times at which the moments of the last hour began.
         newest: the moments that are not stored yet, and the newest one, in order.
@@ -805,6 +806,7 @@ class RuleRecord:
     last_fired: Int64 | None = None
     problem: str | None = None
     unstored: str | None = None
+    never: str | None = None
     always_since: Int64 | None = None
     begun: list[Int64] = field(default_factory=list)
     newest: list[RuleMoment] = field(default_factory=list)

@@ -227,7 +227,8 @@ class FiredRule:
     @property
     def problem(self) -> str | None:
         """Why it may have missed a match, or stores or searches nothing now; None if it works."""
-        problems = dict.fromkeys([self.record.problem, self.record.unstored, self.unread])
+        record = self.record
+        problems = dict.fromkeys([record.never, record.problem, record.unstored, self.unread])
         return "; ".join(filter(None, problems)) or None
 
 

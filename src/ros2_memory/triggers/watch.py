@@ -342,14 +342,13 @@ class _RuleLook:
     def _check_topic(self) -> None:
         """Stores and logs whether the rule can never fire since its topic is not recorded now."""
         topic, record = self.rule.topic, self.record
+        said, record.never = record.never, None
         if topic is None or any(mark in topic for mark in GLOB_MARKS):
             return
-        never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
-        if self.triggers.is_recorded(topic):
-            record.problem = None if record.problem == never else record.problem
-        elif record.problem != never:
-            record.problem = never
-            _log.warning("rule_not_recorded", rule=self.rule.name, reason=never)
+        if not self.triggers.is_recorded(topic):
+            record.never = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
+            if record.never != said:
+                _log.warning("rule_not_recorded", rule=self.rule.name, reason=record.never)
 
     def _store_moments(self) -> None:
         """Stores the waiting moments. Drops refused ones, and stored ones but the newest.

@@ -94,7 +94,7 @@ SCREEN = """{"format":1,"recordings":{"rec_A":{"done":false,"start":1,"end":null
 "unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}],"earlier":[[0,1]],
 "earlier_held":[[0,1]]}"""
 RULES = r"""{"format":1,"rules":{"t\u00fcr":{"fired":1,"moments":2,"refused":3,"last_fired":null,
-"problem":"\u00df","unstored":null,"always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
+"problem":"\u00df","unstored":null,"never":null,"always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
 "start":1,"end":2,"matches":1,"known":false,"stored":false}],
 "runs":{"/a":{"first":1,"last":2,"fired":false,"lasts":false}}}},"searched":{"\udcff":1},"before":"x",
 "latched":{"/m":{"published":{"a":1},"begun":{"a":2},"payload":"ff"}},"unread":{"\udcff":"\u00df"}}"""

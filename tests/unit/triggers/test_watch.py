@@ -151,13 +151,24 @@ def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silen
 def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(tmp_path: Path) -> None:
     robot = WatchedBags(tmp_path / "bags", [rule(hold=S)], unrecorded={"/bumper"})
     assert [each["rule"] for each in robot.log if each["event"] == "rule_not_recorded"]
-    assert "/bumper is not recorded" in (robot.record("bumper").problem or "")
+    assert "/bumper is not recorded" in (robot.problem() or "")
     robot.unrecorded.clear()  # the list was changed, without a restart
     robot.look()
-    assert robot.record("bumper").problem is None
+    assert robot.problem() is None
     robot.unrecorded.add("/bumper")
     robot.look()
-    assert "/bumper is not recorded" in (robot.record("bumper").problem or "")
+    assert "/bumper is not recorded" in (robot.problem() or "")
+
+
+def test_that_a_topic_is_not_recorded_hides_no_other_problem_of_its_rule(tmp_path: Path) -> None:
+    robot = watched(tmp_path)
+    robot.house.triggers.note_deleted(2)
+    for unrecorded in ({"/bumper"}, set()):
+        robot.unrecorded = unrecorded
+        robot.look()
+        problem = robot.problem() or ""
+        assert "2 bags that rules may have needed were deleted" in problem
+        assert ("/bumper is not recorded" in problem) == bool(unrecorded)
 
 
 def test_a_recording_that_ended_unasked_and_a_recorder_that_was_killed(tmp_path: Path) -> None:
