@@ -515,8 +515,7 @@ class ReverseSearch:
                 continue
             owners, names = named
             has_any, firsts = np.unique(owners, return_index=True)
-            index = np.arange(len(part.table)) if part.index is None else part.index
-            places, is_among = places_among(has_any, index)
+            places, is_among = places_among(has_any, part.positions)
             numbers = [self._nodes.setdefault(name, len(self._nodes) + 1) for name in names.words]
             firsts_among = names.codes[firsts[is_among]]
             nodes[positions[places[is_among]]] = np.array(numbers, np.int64)[firsts_among]

@@ -243,8 +243,8 @@ class Estimate:
 
         They are of its topic. 0 if the mover has other detections in this time.
         """
-        names = (Spot.FIRST, Spot.LAST, Spot.TOPIC)
-        first, last, topic = (self.spots[spot, name] for name in names)
+        [row] = self.spots[np.array([spot])]
+        first, last, topic = row[[Spot.FIRST, Spot.LAST, Spot.TOPIC]].tolist()
         start, stop = first - SLICE_NS, last + SLICE_NS
         others = self.spots[mover.spots]
         is_near = (others[:, Spot.LAST] >= start) & (others[:, Spot.FIRST] <= stop)

@@ -150,7 +150,12 @@ def test_the_classes_that_a_detector_is_to_look_for_are_not_seen(
 ) -> None:
     """An open-vocabulary detector is prompted with them; among what it saw are scores or boxes."""
     classes: JsonObject = {"classes": ["cup"], **beside}
-    for value in (classes, {"data": json.dumps(classes)}, {"detections": [classes]}):
+    values: list[JsonValue] = [
+        classes,
+        {"data": json.dumps(classes)},
+        {"detections": [classes]},
+    ]
+    for value in values:
         assert [seen.label for seen in detections_of(value)] == labels
 
 

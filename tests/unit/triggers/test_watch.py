@@ -162,7 +162,9 @@ def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(tmp_path: Path) ->
 
 def test_that_a_topic_is_not_recorded_hides_no_other_problem_of_its_rule(tmp_path: Path) -> None:
     robot = watched(tmp_path)
-    robot.house.triggers.note_deleted(2)
+    triggers = robot.house.triggers
+    assert triggers is not None
+    triggers.note_deleted(2)
     for unrecorded in ({"/bumper"}, set()):
         robot.unrecorded = unrecorded
         robot.look()
