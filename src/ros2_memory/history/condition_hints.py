@@ -96,14 +96,12 @@ def constants_listed(schema: Schema, field: str) -> str:
 
 
 def schemas_of(view: View, type_name: str) -> list[Schema]:
-    """Returns the definitions of a type in the first and the last file that have it.
+    """Returns the definitions of a recorded type in the first and the last file that have it.
 
     They differ after an update of the robot. None are returned of a damaged file.
     """
     timeline = view.timeline
-    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
-    if topic is None:
-        return []
+    topic = next(name for name in timeline.topics() if type_name in timeline.types_of(name))
     schemas: list[Schema] = []
     bags = [timeline.bag_with(topic, type_name, last=last) for last in (False, True)]
     for path in dict.fromkeys(bag.path for bag in bags):

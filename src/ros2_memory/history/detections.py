@@ -133,10 +133,9 @@ class DetectionRows:
             return None
         detections, stamps, frames = columns
         if rows.index is not None:
-            detections, frames = detections.at(rows.index), frames[rows.index]
-            stamps = None if stamps is None else stamps[rows.index]
-        stamps = rows.times if stamps is None else stamps
-        return Detected(rows.times, stamps, detections, frames)
+            detections = detections.at(rows.index)
+        stamps = rows.times if stamps is None else stamps[rows.positions]
+        return Detected(rows.times, stamps, detections, frames[rows.positions])
 
     def _read_messages(self, rows: Rows) -> Detected:
         extractor = self._view.extractor

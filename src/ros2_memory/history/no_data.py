@@ -138,8 +138,9 @@ def resolve_pose_topic(
     configured = view.limits.pose_topic
     only = only_pose_topic(view, what, degrees=degrees)
     if only is not None:
+        thing = "odometry" if len(topics_of_robot(view, what)) > 1 else "topic for it"
         view.notes.add(
-            f"by {only}, {_why_only(view, what)}: data.pose_topic is {configured}, which these "
+            f"by {only}, the only {thing}: data.pose_topic is {configured}, which these "
             "bags do not have"
         )
         return only
@@ -151,11 +152,6 @@ def resolve_pose_topic(
             raise
         detail = f"data.pose_topic is {configured}, which these bags do not have{alternative}"
         raise NoDataError(error.reason, detail, error.notes) from error
-
-
-def _why_only(view: View, what: str) -> str:
-    others = len(topics_of_robot(view, what)) > 1
-    return "the only odometry" if others else "the only topic for it"
 
 
 def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None:

@@ -202,11 +202,9 @@ def read_until_late(
     values: list[V] = []
     since = MAX_NS
     try:
-        for at, value in newest_first:
-            is_late = bool(values) and reading.expired()
+        for since, value in newest_first:
             values.append(value)
-            since = at
-            if is_late:
+            if len(values) > 1 and reading.expired():
                 return values, since
     except QueryTimeoutError:
         if not values:
