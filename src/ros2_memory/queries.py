@@ -456,7 +456,7 @@ def _last_placed(
 
 def _place_pose(view: View, stored: StoredMessage, pose: Pose, frame_id: str | None) -> Pose:
     """Returns the pose in a message in `frame_id`, with the named place; notes tell its flaws."""
-    recording = stored.bag.recording
+    recording = stored.recording
     if not all(map(math.isfinite, pose.position)):
         view.notes.add(_NO_PLACE)
     elif pose.orientation is None:
@@ -504,7 +504,7 @@ def _position_of_body(asked: _Asked, frame_id: str | None) -> results.Position:
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, asked.window.stop))
     if view.limits.places:
-        pose = with_place(view, pose, stored.time, stored.bag.recording)
+        pose = with_place(view, pose, stored.time, stored.recording)
     geodetic, fix_topics = None, topics_of_robot(view, "geodetic")
     if len(fix_topics) == 1:
         near = TimeWindow.around(stored.time, ns_from_unix(view.limits.time_tolerance_s))
@@ -822,14 +822,14 @@ def _newest_of_recording(
     A message of another recording may be another robot's: a note says so.
     """
     newest = view.stream.newest(topic, window)
-    recording = match.bag.recording
-    if newest is None or newest.bag.recording == recording:
+    recording = match.recording
+    if newest is None or newest.recording == recording:
         return newest
     newest = view.sessions.newest(topic, window, recording) or newest
-    if not view.sessions.are_joined(recording, newest.bag.recording):
+    if not view.sessions.are_joined(recording, newest.recording):
         view.notes.add(
             f"the match is of recording {recording.name}, and the value of "
-            f"{newest.bag.recording.name}: no handover proves that both are of one robot"
+            f"{newest.recording.name}: no handover proves that both are of one robot"
         )
     return newest
 

@@ -121,7 +121,7 @@ class Dataset:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as temporary:
             for stored in messages:
-                partition = name_of(stored.bag.recording), stored.time // NS_PER_DAY
+                partition = name_of(stored.recording), stored.time // NS_PER_DAY
                 part = open_parts.pop(partition, None)
                 if part is None:
                     if len(open_parts) == _MAX_OPEN_FILES:

@@ -27,6 +27,7 @@ from ros2_memory.history.context import Call, Memory, Note, Notes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import Channel, Record
@@ -52,6 +53,11 @@ class StoredMessage(NamedTuple):
 
     bag: BagFile
     record: Record
+
+    @property
+    def recording(self) -> Path:
+        """The recording that the bag is of."""
+        return self.bag.recording
 
     @property
     def time(self) -> Ns:

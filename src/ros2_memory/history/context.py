@@ -367,7 +367,7 @@ class Latching:
         if is_carried(stored.bag.file):
             origin = origin_of(stored.record.channel)
             return origin is None or not origin.often
-        return snapshot.timeline.pace(stored.topic, stored.bag.recording).is_rare
+        return snapshot.timeline.pace(stored.topic, stored.recording).is_rare
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.

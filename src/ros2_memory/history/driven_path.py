@@ -409,7 +409,7 @@ def body_at(view: View, at: Ns) -> Body | None:
     stored = view.stream.first(view.moving_topics, TimeWindow.until(at), newest_first=True)
     if stored is None:
         return robot_body(view)
-    session = view.sessions.lending_to(stored.bag.recording, stored.time)
+    session = view.sessions.lending_to(stored.recording, stored.time)
     return robot_body(view, session) or robot_body(view)
 
 
@@ -494,7 +494,7 @@ def newest_of_body(
         messages = (stored for stored in messages if sessions.has(own_session, stored))
     leads: dict[Session, bool] = {}
     for stored in islice(messages, _MOST_TRIED):
-        recorded_in = stored.bag.recording
+        recorded_in = stored.recording
         session = sessions.lending_to(recorded_in, stored.time)
         body = robot_body(view, session)
         if body is None or not leads.get(session, True):
@@ -540,7 +540,7 @@ def no_path(view: View, topic: str, window: TimeWindow) -> NoDataError:
     if body is not None:
         lack = f"places {body.child}"
         try:
-            transform_at(view, body.odometry, body.child, newest.time, newest.bag.recording)
+            transform_at(view, body.odometry, body.child, newest.time, newest.recording)
         except NoDataError as error:
             if error.reason is NoDataReason.FRAME_UNKNOWN:
                 return with_notes(view, window, error)

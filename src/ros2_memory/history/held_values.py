@@ -427,7 +427,7 @@ def newest_stating(
     window = TimeWindow(since, stored.time + 1)
     messages = view.stream.messages([stored.topic], window, newest_first=True)
     for earlier in islice(messages, _MOST_TRIED):
-        is_alike = earlier.bag.recording == stored.bag.recording
+        is_alike = earlier.recording == stored.recording
         if is_alike and _says_something(view, earlier, fields):
             return earlier
     return None

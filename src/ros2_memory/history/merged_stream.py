@@ -172,7 +172,7 @@ class MergedStream:
         rows: list[tuple[Ns, Ns, int, int]] = []
         for stored in self.merged(extents, [topic], around, since=part.start):
             keys.append((stored.bag.file, stored.time, *stored.identity))
-            rows.append((stored.time, *stored.identity, number_of[str(stored.bag.recording)]))
+            rows.append((stored.time, *stored.identity, number_of[str(stored.recording)]))
         columns = np.array(rows, np.int64).reshape(-1, 4).T
         return Counter(compress(keys, copies_among(Identities(*columns))))
 
@@ -189,9 +189,9 @@ class MergedStream:
         if not stored.record.may_be_repeated:
             return False
         self._find_first_copies(stored)
-        own = stored.time, stored.bag.recording
+        own = stored.time, stored.recording
         first_time, first_recording = self._first_copies.get((stored.topic, *stored.identity), own)
-        return stored.time > first_time and stored.bag.recording != first_recording
+        return stored.time > first_time and stored.recording != first_recording
 
     def _find_first_copies(self, repeated: StoredMessage) -> None:
         """Finds the first reception of each message in the time since one was published.
@@ -209,7 +209,7 @@ class MergedStream:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
             for message in self.merged(bags, [topic], part, since=window.start):
-                key, reception = (topic, *message.identity), (message.time, message.bag.recording)
+                key, reception = (topic, *message.identity), (message.time, message.recording)
                 self._first_copies[key] = min(reception, self._first_copies.get(key, reception))
         self._searched[topic] = united([*searched, *missing])
 

@@ -408,7 +408,7 @@ def _may_hold_on(view: View, older: StoredMessage, at: Ns) -> bool:
 
     Such a topic says what a robot does when that changes, and nothing interrupted the recording.
     """
-    pace = view.timeline.pace(older.topic, older.bag.recording)
+    pace = view.timeline.pace(older.topic, older.recording)
     is_of_same_run = at <= pace.end and not view.gaps(TimeWindow(older.time + 1, at))
     return is_text(view, older.topic) and pace.is_rare and is_of_same_run
 
@@ -446,7 +446,7 @@ def _reason_within_recording(
     if is_thinned(older.bag.file) and not view.gaps(TimeWindow(older.time + 1, newer.time)):
         why = "of that time only some messages stayed: retention deleted the others"
         return NoDataReason.DELETED, [why]
-    pace = view.timeline.pace(older.topic, older.bag.recording).topic
+    pace = view.timeline.pace(older.topic, older.recording).topic
     period = (pace.last - pace.first) // max(pace.messages - 1, 1)
     if newer.time - older.time <= 2 * period:
         pace_text = f"the topic has a message every {seconds(period)}"

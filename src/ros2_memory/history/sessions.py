@@ -137,7 +137,7 @@ class Sessions:
 
     def has(self, session: Session, stored: StoredMessage) -> bool:
         """Whether a message is of a session. A carried one without an origin is of each."""
-        folder = self.folder(stored.bag.recording)
+        folder = self.folder(stored.recording)
         if folder != self._carried:
             return folder in session
         origin = origin_of(stored.record.channel)

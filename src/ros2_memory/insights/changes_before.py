@@ -441,7 +441,7 @@ def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | No
     speed_mps = None if twist is None else math.hypot(*twist.linear)
     if pose is None:
         return None, speed_mps
-    recording = message.bag.recording
+    recording = message.recording
     placed_pose = pose_if_placed(view, pose, message.time, recording, frame_id)
     if placed_pose is None:
         return None, speed_mps

@@ -480,7 +480,7 @@ def _sighting(
     thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun > 0
     at = run.first if robot_at_first else run.last
-    newest_recording = newest.bag.recording
+    newest_recording = newest.recording
     recording = recording_at(view, newest.topic, at, newest_recording) or newest_recording
     robot = robot_at(view, at, recording, frame_id)
     if robot is None and robot_at_first:
@@ -534,7 +534,7 @@ def _goal_sighting(
     message = view.stream.last(goal.topic, goal.last + 1)
     robot = None
     if message is not None:
-        robot = robot_at(view, goal.last, message.bag.recording, frame_id)
+        robot = robot_at(view, goal.last, message.recording, frame_id)
     sighting = Sighting(
         topic=goal.topic,
         first=goal.first,
@@ -655,11 +655,11 @@ def _place_of_detection(
     seen, time = Pose(thing.place, None, thing.frame_id), seen_at(view, message)
     position, frame = thing.place, thing.frame_id
     for target in targets:
-        placed = pose_in(view, seen, target, time, message.bag.recording)
+        placed = pose_in(view, seen, target, time, message.recording)
         if placed is not None:
             position, frame = placed.position, target
             break
-    inside = with_place(view, seen, time, message.bag.recording).places
+    inside = with_place(view, seen, time, message.recording).places
     return LabelledPlace(thing.label, position, frame, inside)
 
 

@@ -141,11 +141,11 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     stored, pose = newest_pose(view, _topic_of_robot(view), window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
-    in_frame = pose_if_placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    in_frame = pose_if_placed(view, pose, stored.time, stored.recording, frame_id)
     if in_frame is None:
         return None
     view.notes.add(*axes_of(in_frame.frame_id))
-    return with_place(view, in_frame, stored.time, stored.bag.recording)
+    return with_place(view, in_frame, stored.time, stored.recording)
 
 
 def pose_in_map(
