@@ -628,7 +628,7 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
         Filling(
             scanner,
             memory.reader,
-            memory.index.bag_dir,
+            memory.bag_dir,
             memory.clock,
             StoreLimits(store.max_share, round(store.max_gb * GB)),
             large=memory.large,

@@ -185,7 +185,7 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.lake.memory import LakeIndex, LakeReader
 
-    index = LakeIndex(lake, name, memory.index.bag_dir, memory.clock)
+    index = LakeIndex(lake, name, memory.bag_dir, memory.clock)
     reader = LakeReader(index, memory.reader, shared.large)
     store = build_columns(own, shared.reader, name)
     reading = reading_of(own, shared.extractor.schemas)

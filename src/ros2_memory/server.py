@@ -235,7 +235,7 @@ def _parts_of_fleet(
         robot = fleet.robots[name]
         backfill = build_backfill(robot_settings(settings, name), robot.memory)
         if not robot.in_lake:  # the helper reads bags of a bag directory, not of a lake
-            options = "--bag-dir", str(robot.memory.index.bag_dir.absolute())
+            options = "--bag-dir", str(robot.memory.bag_dir.absolute())
             backfill.helper = _helper_command(overrides, *options)
         return backfill
 

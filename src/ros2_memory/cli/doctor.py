@@ -161,7 +161,7 @@ def _examine(bags: Bags) -> Iterator[Finding]:
             yield from _run_checks({"lake": check_lake} | _OF_SETTINGS, settings)
         return
     with spinner("asking the disk, ros2, the recorder and the server"):
-        robot = Examined(settings, memory, memory.index.snapshot(), memory.clock.now())
+        robot = Examined(settings, memory, memory.snapshot(), memory.clock.now())
         yield from _run_checks(_OF_BAGS, robot)
         if robot.records:
             yield from _run_checks(_OF_RECORDER, robot)
@@ -190,7 +190,7 @@ def _examine_robot(name: str, fleet: Settings, *, verbose: bool) -> Iterator[Fin
     except EpisodicError as refused:
         yield Finding(Level.ERROR, "robot", f"{name}: {refused}", _CORRECT)
         return
-    snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
+    snapshot, bag_dir = memory.snapshot(), own.recording.bag_dir
     if snapshot.problem or not (snapshot.bags or snapshot.active):
         seen = f"{name}: {bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
         do = f"is the disk mounted? {ROBOTS_SETTING} names its directory"
@@ -247,7 +247,7 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
         yield warning(seen, f"{do}{max(room_gb, 0):.1f}, or make room")
     else:
         yield ok(seen)
-    if leaving := describe_leaving(robot.memory.index.bag_dir):
+    if leaving := describe_leaving(robot.memory.bag_dir):
         yield warning(leaving, "memory.keep=true keeps it")
 
 
@@ -364,7 +364,7 @@ def _remedy(file: SetAside, memory: Memory) -> str:
         return _READ
     with suppress(BagError):
         if file.path.suffix == MCAP and not memory.reader.is_finished(file.path):
-            return f"ros2-memory recover {shlex.quote(str(memory.index.bag_dir))}"
+            return f"ros2-memory recover {shlex.quote(str(memory.bag_dir))}"
     return "copy them again from their source; what is so there, too, cannot be read"
 
 

@@ -240,7 +240,7 @@ def _export_to_parquet(
     require_extra("export --parquet", "parquet", "pyarrow")
     from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
 
-    dataset = Dataset(folder, memory.index.bag_dir, memory.reader, memory.extractor, robot)
+    dataset = Dataset(folder, memory.bag_dir, memory.reader, memory.extractor, robot)
     dataset.write(messages)
     fault = ""
     if dataset.undecoded:

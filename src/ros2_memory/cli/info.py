@@ -38,7 +38,7 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     """
     memory = bags.memory()
     topic_rows = list_recorded_topics(memory, Call())
-    snapshot, latching = memory.index.snapshot(), memory.limits.latching
+    snapshot, latching = memory.snapshot(), memory.limits.latching
     rows = [_row_with_rate(row, snapshot, latching) for row in topic_rows]
     if as_json:
         print_json(rows)
@@ -54,8 +54,8 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 def _print_nothing(memory: Memory) -> None:
     """Prints why there is no bag to show, and the files that cannot be read."""
-    snapshot = memory.index.snapshot()
-    print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
+    snapshot = memory.snapshot()
+    print_line(f"{memory.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
     for aside in (*snapshot.damaged, *snapshot.unread):
         print_line(f"  {aside.path.name}: {aside.reason}")
 
@@ -81,7 +81,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     for name in robots or ("",):
         own, memory = open_robot(settings, name, verbose=bags.verbose)
         reports[name] = report = _report(own, memory)
-        has_bags = has_bags or bool(memory.index.snapshot().bags)
+        has_bags = has_bags or bool(memory.snapshot().bags)
         if robots and not as_json:
             print_line(f"\n{name}")
         if not as_json:
@@ -93,7 +93,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
     """Returns the amount of data in a bag directory, and the replies of two tools."""
-    report = {"held": _amount_recorded(memory.index.snapshot())}
+    report = {"held": _amount_recorded(memory.snapshot())}
     for tool in ("memory_status", "data_time_range"):
         report[tool] = json.loads(call_once(build_dispatcher(settings, memory), tool, {}).text)
     return report
@@ -101,7 +101,7 @@ def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
 
 def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
     """Prints the values of a report that are known, each once."""
-    snapshot = memory.index.snapshot()
+    snapshot = memory.snapshot()
     files = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any(files):
         _print_nothing(memory)
@@ -146,7 +146,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     the server.
     """
     memory = bags.memory()
-    snapshot, root = memory.index.snapshot(), memory.index.bag_dir
+    snapshot, root = memory.snapshot(), memory.bag_dir
     rows, not_read = [*_recording_rows(snapshot, root)], [*_files_not_read(snapshot, root)]
     is_empty = not (rows or snapshot.damaged or snapshot.unread)
     if as_json:

@@ -293,7 +293,7 @@ def open_memory(
     with spinner(f"looking through {settings.recording.bag_dir}"):
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:
-        bag_dir = memory.index.bag_dir
+        bag_dir = memory.bag_dir
         names = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
         near = similar(settings.data.recording, names)
         which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
@@ -318,7 +318,7 @@ def present_time(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
     if memory.limits.now == "wall":  # A fleet has no bags of its own, which a scan would report.
         return memory.clock.now()
-    return memory.now(memory.index.snapshot().dating.latest)
+    return memory.now(memory.snapshot().dating.latest)
 
 
 def parse_duration(text: str) -> float | None:

@@ -279,7 +279,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     Raises:
         InvalidArgumentsError: the tool refuses the question.
     """
-    memory = replace(memory, scanner=Scanner(None, memory.index.bag_dir))
+    memory = replace(memory, scanner=Scanner(None, memory.bag_dir))
     tool, *arguments = words
     reply = answer_to(build_dispatcher(settings, memory, is_patient=True), memory, tool, arguments)
     answer: JsonValue = json.loads(reply.text)

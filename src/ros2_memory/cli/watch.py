@@ -70,7 +70,7 @@ def watch(
 
 def _observe(memory: Memory) -> JsonObject:
     """Returns the current state: times in Unix seconds, rates in Hz, ages in seconds."""
-    snapshot = memory.index.snapshot()
+    snapshot = memory.snapshot()
     status, latest = memory_status(memory, Call()), snapshot.dating.latest
     is_live = latest is not None and _is_live(memory, snapshot, status, latest)
     missing = status.missing if status.live else ()
@@ -112,7 +112,7 @@ def _rates(
     length = min(max(latest - begun, NS_PER_S), WINDOW_NS)
     window, window_s = TimeWindow(latest - length + 1, latest + 1), unix_from_ns(length)
     timeline, latching = snapshot.timeline, memory.limits.latching
-    bag_dir, view = memory.index.bag_dir, View(memory, Call())
+    bag_dir, view = memory.bag_dir, View(memory, Call())
     is_excluded = bool(excluded_spans(bag_dir, window))
     for topic in timeline.topics():
         if latching.is_latched(snapshot, topic):

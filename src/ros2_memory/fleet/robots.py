@@ -230,7 +230,7 @@ class Fleet:
         """
 
         def read_latest(memory: Memory, _: Call) -> tuple[Ns, Memory]:
-            return memory.index.snapshot().dating.latest or MIN_NS, memory
+            return memory.snapshot().dating.latest or MIN_NS, memory
 
         answers = FanOut().ask(
             self.chosen(named, call), lambda robot, own: robot.ask(read_latest, own)[0], call

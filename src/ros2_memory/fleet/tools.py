@@ -161,7 +161,7 @@ class _FleetQuestion:
             answer, lake = self._ask_memory(robot, partial(_answer, self.question), own)
             report = self._lake_report(answer, lake)
             notes = () if report is None else (*shipped_to({robot.name: report}), *report.notes)
-            return OfRobot(robot.name, robot.memory.index.bag_dir, answer, notes, own.now)
+            return OfRobot(robot.name, robot.memory.bag_dir, answer, notes, own.now)
 
         answer_or_error = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(answer_or_error, EpisodicError):
@@ -200,7 +200,7 @@ class _FleetQuestion:
         """
 
         def ask(memory: Memory, own: Call) -> tuple[RobotReply, OneAnswer]:
-            snapshot = memory.index.snapshot()
+            snapshot = memory.snapshot()
             if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
                 # "Never" would be a claim about bags that were not searched.
                 raise errors.RefusedError(snapshot.problem)
@@ -212,7 +212,7 @@ class _FleetQuestion:
             if isinstance(answer, Sightings) and not is_ahead:
                 page.add(sighting.last for sighting in answer.sightings)
                 page.add(episode.until for episode in answer.episodes)
-            value = as_json(answer, memory.index.bag_dir)
+            value = as_json(answer, memory.bag_dir)
             if own.now is not None and isinstance(value, dict):
                 value = {"now": unix_rounded_up(own.now), **value}
             return RobotReply(robot.name, value, latest, is_ahead), answer

@@ -320,7 +320,7 @@ class BagAccess:
         part = _indexed_part(bag, TimeWindow.everything() if around else window)
         cache = self.memory.scanner.caches.decoded
         key = (bag.identity, topic, part, hashed, columns)
-        is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
+        is_lasting = is_settled(bag, self.memory.bag_dir, self.snapshot.scanned_at)
         cached = cache.get(key) if is_lasting else None
         groups: Iterator[list[Table]] = iter(cached or ())
         if cached is None:

@@ -142,6 +142,11 @@ class Memory:
     memo: Memo = field(default_factory=Memo)
     fixed: Snapshot | None = None
 
+    @property
+    def bag_dir(self) -> Path:
+        """Where its bags are."""
+        return self.index.bag_dir
+
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
         """Returns the fixed snapshot, else a current one that reaches the log time `reach`."""
         return self.fixed or self.index.snapshot(reach)
@@ -153,13 +158,13 @@ class Memory:
         """
         if self.limits.kept is None or not self.limits.kept.keeps_foreign:
             return None
-        bags = self.memo.of(_FOREIGN, lambda: ForeignBags(self.index.bag_dir))
+        bags = self.memo.of(_FOREIGN, lambda: ForeignBags(self.bag_dir))
         heartbeat = self.index.heartbeat()
         return bags.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns the splits that a recording's metadata.yaml lists and that are missing."""
-        return absent_splits(snapshot, self.index.bag_dir, self._listings())
+        return absent_splits(snapshot, self.bag_dir, self._listings())
 
     def store_listings(self, snapshot: Snapshot) -> None:
         """Stores what each metadata.yaml lists, so that the next start need not read them."""
@@ -167,7 +172,7 @@ class Memory:
         if store is None:
             return
         self.absent_splits(snapshot)
-        listings, root = self._listings(), str(self.index.bag_dir)
+        listings, root = self._listings(), str(self.bag_dir)
         store.put_listings(
             {
                 relative(folder, root): listing_to_json(*listings[folder])
@@ -184,7 +189,7 @@ class Memory:
             texts = {} if self.scanner.store is None else self.scanner.store.listings()
             for folder, text in texts.items():
                 with suppress(ValueError, TypeError, OverflowError):
-                    listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
+                    listings[str(self.bag_dir / folder)] = listing_from_json(text)
             return listings
 
         return self.memo.of(_LISTINGS, load)

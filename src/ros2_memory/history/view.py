@@ -90,7 +90,7 @@ class View:
         self.snapshot = self.bags.snapshot
         self.timeline = self.snapshot.timeline
         self.limits, self.extractor = memory.limits, memory.extractor
-        self.bag_dir = memory.index.bag_dir
+        self.bag_dir = memory.bag_dir
         self.notes = self.bags.notes
         self.memo = Memo()
 

@@ -49,7 +49,7 @@ def remember_moment(
     start, end = now - ns_from_unix(seconds_before), now + ns_from_unix(seconds_after)
     asked = memory.clock.now()
     request = PendingRequest(
-        memory.index.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked
+        memory.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked
     )
     try:
         request.post()
@@ -110,7 +110,7 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     with _refuse_unreadable():
         moments, unreadable = _moments_of(memory)
     with _refuse_unreadable(TRIGGERS_FILE):
-        rules = fired_rules(memory.index.bag_dir)
+        rules = fired_rules(memory.bag_dir)
     newest = sorted(
         moments.values(),
         key=lambda saved: (saved.moment.request.end, saved.folder.name),
@@ -140,7 +140,7 @@ def _refuse_unreadable(name: str = f"{MOMENTS_FOLDER}/") -> Iterator[None]:
 
 def _moments_of(memory: Memory) -> StoredMoments:
     """Returns the saved moments; if one recording alone answers, the moments with bags of it."""
-    recording, bag_dir = memory.limits.recording, memory.index.bag_dir
+    recording, bag_dir = memory.limits.recording, memory.bag_dir
     stored = stored_moments_in(bag_dir)
     if not recording:
         return stored

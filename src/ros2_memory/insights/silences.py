@@ -36,7 +36,7 @@ def silences_of(
     A latched topic is never silent, since its value holds. Where messages were deleted, no topic
     was silent.
     """
-    bag_dir, latching = memory.index.bag_dir, memory.limits.latching
+    bag_dir, latching = memory.bag_dir, memory.limits.latching
     excluded = excluded_spans(bag_dir)
     deleted = cache(lambda topic: cut_spans(bag_dir, topic, TimeWindow.everything()))
     is_latched = cache(partial(latching.is_latched, snapshot))

@@ -120,7 +120,7 @@ def _status_problems(
     view: View, heartbeat: Heartbeat | None, heard: Ns | None, mixed: Sequence[str], wall: Ns
 ) -> Iterator[str]:
     """Yields what is wrong. `mixed` are the sentences on recordings of several robots."""
-    latest, bag_dir = view.snapshot.dating.latest, view.memory.index.bag_dir
+    latest, bag_dir = view.snapshot.dating.latest, view.bag_dir
     until_now = TimeWindow(MIN_NS, max(wall, latest or wall) + 1)
     yield from problems_of(view.snapshot, heartbeat, wall)
     if heard is not None and latest is not None and latest - heard > _UNHEARD_NS:
@@ -139,7 +139,7 @@ def _status_notes(
     view: View, heartbeat: Heartbeat | None, mixed: Sequence[str], *, live: bool
 ) -> Iterator[str]:
     """Yields what explains a status, and is no problem."""
-    bag_dir, everything = view.memory.index.bag_dir, TimeWindow.everything()
+    bag_dir, everything = view.bag_dir, TimeWindow.everything()
     yield from view.notes.sentences()
     if heartbeat is not None and live:
         # What is kept too long while the clock may be wrong, and what no lake has.
@@ -316,9 +316,9 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         usual_period = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual_period, snapshot.longest_silence(topic))
         since = TimeWindow(last + 1, latest + 1)
-        excluded = length_in(excluded_spans(memory.index.bag_dir, since), last, latest)
+        excluded = length_in(excluded_spans(memory.bag_dir, since), last, latest)
         is_long = latest - last - excluded > max(SILENT_AFTER_NS, longest)
-        is_cut = bool(cut_spans(memory.index.bag_dir, topic, since))
+        is_cut = bool(cut_spans(memory.bag_dir, topic, since))
         if is_long and not is_cut and not are_unlisted(memory, [topic]):
             yield SilentTopic(topic, last)
 
@@ -334,7 +334,7 @@ def budget_of(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, w
     if kept is None:
         return Budget(used, None, None, None)
     foreign = memory.foreign(snapshot)
-    state = state_bytes_in(memory.index.bag_dir)
+    state = state_bytes_in(memory.bag_dir)
     used += state - (0 if foreign is None else foreign.bag_bytes)
     per_day = None
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING

@@ -290,7 +290,7 @@ class RobotBags:
     @property
     def bag_dir(self) -> Path:
         """The bag directory."""
-        return self.memory.index.bag_dir
+        return self.memory.bag_dir
 
     def report(self, problem: object) -> None:
         """Adds a problem of the robot to the pass, unless it is known."""
@@ -310,7 +310,7 @@ class RobotBags:
 
     def keep_up(self) -> None:
         """Deletes stored columns of bags that are gone; tries a store again whose disk failed."""
-        snapshot = self.memory.index.snapshot()
+        snapshot = self.memory.snapshot()
         if self.filling is not None and snapshot.problem is None:
             self.filling.store.look_after()
             self.filling.store.write_again()
@@ -444,7 +444,7 @@ class RobotBags:
         if filling.store.path is None or filling.store.is_failing:
             return
         self._cut_to_share(filling)
-        timeline = self.memory.index.snapshot().timeline
+        timeline = self.memory.snapshot().timeline
         for bag in bags:
             batch = waiting.get(bag.file)
             if batch is not None:

@@ -145,7 +145,7 @@ class Backfill:
 
     def progress(self) -> Progress:
         """Returns how much is stored."""
-        timeline = self.memory.index.snapshot().timeline
+        timeline = self.memory.snapshot().timeline
         if self.filling is None:
             return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
         return self.filling.progress(timeline)
@@ -155,7 +155,7 @@ class Backfill:
 
         A missing bag directory is more likely a missing disk than an empty one.
         """
-        snapshot = self.memory.index.snapshot()
+        snapshot = self.memory.snapshot()
         if self.filling is None or snapshot.problem is not None:
             return otherwise
         return work(self.filling, snapshot.timeline)
@@ -234,7 +234,7 @@ class Backfill:
         if timeline.bags:
             filling.prune(timeline)
             self._gone_after_prune, _ = filling.count_gone(timeline)
-            self.memory.store_listings(self.memory.index.snapshot())
+            self.memory.store_listings(self.memory.snapshot())
 
 
 def make_fragments(

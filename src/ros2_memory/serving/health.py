@@ -132,7 +132,7 @@ class FleetHealth:
 def _health_report(memory: Memory, backfill: Backfill | None) -> JsonObject:
     """Returns what `/health` shows of one memory."""
     now = memory.clock.now()
-    snapshot = memory.index.snapshot()
+    snapshot = memory.snapshot()
     heartbeat = memory.heartbeat()
     dating = snapshot.dating
     faulty = {

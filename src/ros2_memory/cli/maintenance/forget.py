@@ -110,7 +110,7 @@ def forget(
         if not times.are_bounded:
             raise InvalidArgumentsError(f"give a time window: {BOUNDED}")
         memory = open_memory(settings, verbose=verbose)
-        if problem := memory.index.snapshot().problem:
+        if problem := memory.snapshot().problem:
             raise RecorderError(problem)
         window = times.window(memory)
         work = _Forget(settings, memory, dry_run=dry_run)
@@ -143,7 +143,7 @@ class _Forget:
             with _recorder_locked_out(self._bag_dir) as self._recorder:
                 pass
         self._unreadable: set[Path] = set()
-        snapshot = memory.index.snapshot()
+        snapshot = memory.snapshot()
         self._written = {
             aside.path: self._span_written(aside, snapshot) for aside in snapshot.active
         }

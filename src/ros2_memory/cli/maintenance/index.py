@@ -112,7 +112,7 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> _Fille
         RecorderError: the bag directory cannot be read.
     """
     settings, memory = open_robot(settings, robot, verbose=verbose)
-    if problem := memory.index.snapshot().problem:
+    if problem := memory.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
     if backfill.filling is None:

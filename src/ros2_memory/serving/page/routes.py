@@ -146,7 +146,7 @@ def memory_name(memory: Memory) -> JsonObject:
 
     The name is that of the machine if it records here, else that of the folder.
     """
-    folder = memory.index.bag_dir.resolve()
+    folder = memory.bag_dir.resolve()
     is_robot = memory.limits.kept is not None
     return {"name": gethostname() if is_robot else folder.name, "folder": str(folder)}
 

@@ -224,7 +224,7 @@ def span_shown(
     """
     filling = None if progress is None else progress()
     # If a recorder runs, a time past the newest bag makes the index scan the folder.
-    snapshot = memory.index.snapshot(memory.clock.now() if memory.limits.now == "wall" else None)
+    snapshot = memory.snapshot(memory.clock.now() if memory.limits.now == "wall" else None)
     version = _version(snapshot, filling, 0 if questions is None else questions.count)
     now = moment(memory.now(snapshot.latest))
     if version == request.version:
@@ -240,7 +240,7 @@ def span_shown(
         shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
         shown["range"] = _recorded_range(memory, call, snapshot)
-        shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
+        shown["status"] = render(memory_status(memory, call), memory.bag_dir)
     if earliest is not None and latest is not None:
         window = request.window(earliest, latest)
         fresh = _fresh_window(snapshot, window, request.since_s)
@@ -303,7 +303,7 @@ def _filling_state(filling: Progress | None) -> JsonObject | None:
 def _recorded_range(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
     """Returns the recorded range with its longest gaps, and the days that were thinned, if any."""
     recorded = data_time_range(memory, call)
-    shown: JsonObject = {**render(recorded, memory.index.bag_dir), "gaps": _gaps(recorded)}
+    shown: JsonObject = {**render(recorded, memory.bag_dir), "gaps": _gaps(recorded)}
     if thinned := snapshot.timeline.thinned_times:
         shown["thinned"] = [[_unix_s(start), _unix_s(stop)] for start, stop in thinned]
     return shown
