@@ -136,28 +136,18 @@ class HeldValues:
         self._require_single_value(asked, until)
 
     def _require_single_value(self, asked: str, until: Ns) -> None:
-        newest: StoredMessage | None = None
-        value: JsonValue = None
         window = TimeWindow(MIN_NS, until)
         messages = self._view.stream.messages([self._topic], window, newest_first=True)
-        for newest in islice(messages, _MOST_TRIED):
+        newest, value = next(self._stated(islice(messages, _MOST_TRIED)), (None, None))
+        if newest is None:
+            names = self._field and names_without(self._view, self._topic, self._field, until)
+            if self._field and names:
+                raise InvalidArgumentsError(f"{asked}: {unnamed(self._topic, self._field, names)}")
+        elif value is None and self._field is not None:
+            # Null is a value, as behind the end of a list, unless there is no such field.
             message = self._view.bags.decode(newest)
-            if message is None:
-                return
-            value = self._value_of(message, newest.type)
-            if self._is_unstated(value, message, newest.type):
-                continue
-            if value is None and self._field is not None:
-                # Null is a value, as behind the end of a list, unless there is no such field.
-                self._view.extractor.shown(message, newest.type, [self._field])
-                return
-            break
-        if value is None and self._field is not None:
-            names = names_without(self._view, self._topic, self._field, until)
-            if names:
-                sentence = unnamed(self._topic, self._field, names)
-                raise InvalidArgumentsError(f"{asked}: {sentence}")
-        if newest is not None and isinstance(value, list | dict | None):
+            self._view.extractor.shown(message, newest.type, [self._field])
+        elif isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             how = f"as {self._topic}.FIELD" if asked == "with" else "where the tool takes fields"
             advice = self._advice_on_element(newest) or (
@@ -303,14 +293,26 @@ class HeldValues:
         """Yields a run for each message in the time of some rows."""
         first, last = min(rows.first for rows in block), max(rows.last for rows in block)
         part = window.intersect(TimeWindow(first, last + 1))
-        for stored in self._view.stream.messages([self._topic], part, newest_first=newest_first):
+        messages = self._view.stream.messages([self._topic], part, newest_first=newest_first)
+        for stored, value in self._stated(messages):
             self._check(stored.time)
-            message = self._view.bags.decode(stored)
-            if message is None:
-                continue
+            yield _Run(json.dumps(value), stored.time, stored.time)
+
+    def _stated(
+        self, messages: Iterable[StoredMessage]
+    ) -> Iterator[tuple[StoredMessage, JsonValue]]:
+        """Yields messages with their value, without those that name other elements (joints) alone.
+
+        Those say nothing of the field.
+        """
+        extractor, field = self._view.extractor, self._field
+        for stored, message in self._view.bags.decoded(messages):
             value = self._value_of(message, stored.type)
-            if not self._is_unstated(value, message, stored.type):
-                yield _Run(json.dumps(value), stored.time, stored.time)
+            if value is None and field is not None:
+                path = extractor.own_path(field, stored.type)
+                if names_others(extractor.exact(message, stored.type), path):
+                    continue
+            yield stored, value
 
     def _value_of(self, message: object, type_name: str) -> JsonValue:
         """Returns the value in a message; an object with one key stands for its value."""
@@ -324,14 +326,6 @@ class HeldValues:
         if isinstance(value, dict) and len(value) == 1 and not isinstance(value, Summary):
             [value] = value.values()
         return _canonical(value)
-
-    def _is_unstated(self, value: JsonValue, message: object, type_name: str) -> bool:
-        """Whether a message says nothing of the field: it names other elements (joints) alone."""
-        if value is not None or self._field is None:
-            return False
-        extractor = self._view.extractor
-        path = extractor.own_path(self._field, type_name)
-        return names_others(extractor.exact(message, type_name), path)
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""
