@@ -602,10 +602,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     after the memory.
     """
     snapshot = view.snapshot
-    reach = recorded_reach(snapshot, asked)
-    if reach is None:
-        return
-    first, last = reach
+    first, last = recorded_reach(snapshot, asked)
     start, end = asked.asked()
     start = max(start, min(0, first))
     until = last if asked.stop >= MAX_NS else view.memory.now(snapshot.latest)
@@ -636,13 +633,13 @@ def why_nothing(when: str, *, deleted: bool) -> str:
     return f"what was recorded {when} was deleted" if deleted else f"nothing was recorded {when}"
 
 
-def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span | None:
-    """Returns the first and the last log time of the memory; None without bags.
+def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> Span:
+    """Returns the first and the last log time of the memory; without bags, those of the window.
 
     Misdated bags count only if the window has no other: then their recordings alone do.
     """
     if snapshot.earliest is None or snapshot.latest is None:
-        return None
+        return window.asked()
     reach = snapshot.earliest, snapshot.latest
     if window.overlaps(*reach):
         return reach
@@ -660,13 +657,13 @@ def shown_span(snapshot: Snapshot, window: TimeWindow) -> Span:
     The last is before the first if the memory can show nothing of the window.
     """
     start, end = window.asked()
-    first, last = recorded_reach(snapshot, window) or (start, end)
+    first, last = recorded_reach(snapshot, window)
     return max(start, first), min(end, last)
 
 
 def shown_window(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show; see `recorded_reach`."""
-    first, last = recorded_reach(snapshot, window) or (window.start, window.stop - 1)
+    first, last = recorded_reach(snapshot, window)
     return window.intersect(TimeWindow(first, last + 1))
 
 
@@ -702,7 +699,7 @@ def unknown_times(
         mixed: when two robots say different things: then it is not known.
     """
     start, end = window.asked()
-    first, last = recorded_reach(view.snapshot, window) or (0, 0)
+    first, last = recorded_reach(view.snapshot, window)
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
     gaps = united([*recording_gaps(view), *view.skipped_in(window)])
     between = without([around], united([*known, *mixed, *gaps]))

@@ -85,10 +85,10 @@ def in_each(
     snapshot = memory.snapshot(min(search_window(span, wall).stop, wall))
     whole = search_window(span, memory.now(snapshot.latest, call))
     start, end = whole.asked()
-    first, last = recorded_reach(snapshot, whole) or (0, -1)
+    first, last = recorded_reach(snapshot, whole)
     # A window up to midnight has nothing of the next day.
     asked = TimeWindow(start, max(end, start + 1)).intersect(TimeWindow(first, last + 1))
-    windows = hours_of_days(asked, *between)
+    windows = hours_of_days(asked, *between) if snapshot.bags else []
     if not windows:
         detail = "nothing is recorded between these hours in this window"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)

@@ -141,8 +141,7 @@ def find_matches(
 def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> Span:
     """Returns from when to when (ns) a window was searched, also in bags of a wrong clock."""
     start, end = window.asked()
-    first, last = recorded_reach(view.snapshot, window) or (start, end)
-
+    first, last = recorded_reach(view.snapshot, window)
     start = min(max(start, min([first, *shown_at])), end)
     return start, max(min(end, max([last, *shown_at])), start)
 
