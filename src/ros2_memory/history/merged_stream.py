@@ -115,14 +115,13 @@ class MergedStream:
         self, topics: Sequence[str], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[StoredMessage]:
         near = self.overlapping_bags(topics, window.widened(COPY_HORIZON_NS))
-        inside = [extent for extent in near if window.overlaps(extent.first, extent.last)]
-        messages = self.merged(inside, topics, window, newest_first=newest_first)
+        messages = self.merged(near, topics, window, newest_first=newest_first)
         shared = overlap_spans((extent.first, extent.last, extent.bag.recording) for extent in near)
         if shared:
             messages = self._without_copies(messages, window, shared)
         if self.may_be_repeated(topics):
             messages = (message for message in messages if not self._is_repeated(message))
-        if all(extent.bag.state is BagState.CLOSED for extent in inside):
+        if all(extent.bag.state is BagState.CLOSED for extent in near):
             return messages
         return self.bags.track_sources(messages)
 
@@ -222,10 +221,13 @@ class MergedStream:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Yields all messages in order, including copies. Opens a bag when the stream reaches it.
+        """Yields all messages of bags in order, including copies.
+
+        Opens a bag when the stream reaches it, and none without messages in the window.
 
         A note reports what cannot be read, unless all of it lies before `since`.
         """
+        bags = [extent for extent in bags if window.overlaps(extent.first, extent.last)]
         read = partial(self.bags.read, topics=topics, newest_first=newest_first, since=since)
         if len(bags) == 1:
             yield from read(bags[0].bag, window=_part_with_messages(bags[0], window))

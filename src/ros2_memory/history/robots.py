@@ -501,21 +501,14 @@ def _lacks_most(
     edges = [both.start + length * nth // _TRIED for nth in range(_TRIED + 1)]
     tried, lacking = 0, 0
     for start, stop in pairwise(edges):
-        stored = next(_merged_messages(view, topic, first, TimeWindow(start, stop)), None)
+        stored = next(view.stream.merged(first, [topic], TimeWindow(start, stop)), None)
         if stored is None:
             continue
         tried += 1
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
-        copies = _merged_messages(view, topic, other, near)
+        copies = view.stream.merged(other, [topic], near)
         if stored.identity not in (copy.identity for copy in copies):
             lacking += 1
         if 2 * lacking > _TRIED:
             return True  # the rest of the sample cannot change that
     return 2 * lacking > tried
-
-
-def _merged_messages(
-    view: View, topic: str, bags: Sequence[TopicExtent], window: TimeWindow
-) -> Iterator[StoredMessage]:
-    inside = [extent for extent in bags if window.overlaps(extent.first, extent.last)]
-    return view.stream.merged(inside, [topic], window)
