@@ -157,19 +157,13 @@ class _Folder:
     has_metadata: bool = False
     is_away: bool = False
 
-    @property
-    def stamps(self) -> dict[str, Stamp]:
-        """The stamps of all bags, by path."""
-        names = self.names.split("/") if self.names else []
-        return self._stamps_by_path(names, self.rows)
-
-    def stamps_of(self, paths: Iterable[str]) -> dict[str, Stamp]:
-        """Returns the stamps of some bags, by path: the folder may have a week of others."""
-        wanted, names = {path.rpartition("/")[2] for path in paths}, self.names.split("/")
-        rows = [row for row, name in enumerate(names) if name in wanted]
-        return self._stamps_by_path([names[row] for row in rows], self.rows[rows])
-
-    def _stamps_by_path(self, names: Sequence[str], rows: NDArray[np.void]) -> dict[str, Stamp]:
+    def stamps(self, among: Iterable[str] | None = None) -> dict[str, Stamp]:
+        """Returns the stamps of all bags, by path; or of some: there may be a week of others."""
+        names, rows = self.names.split("/") if self.names else [], self.rows
+        if among is not None:
+            wanted = {path.rpartition("/")[2] for path in among}
+            chosen = [row for row, name in enumerate(names) if name in wanted]
+            names, rows = [names[row] for row in chosen], rows[chosen]
         root, sidecar = self.path.rstrip("/"), self.sidecar_ns
         stamps = {
             f"{root}/{name}": Stamp(size, mtime, ctime, inode, sidecar)
@@ -286,8 +280,8 @@ class Tree:
         for path, folder in before.items():
             after = self._folders.get(path)
             if after is not folder:
-                there = {} if after is None else after.stamps
-                result.gone.update(folder.stamps.keys() - there)
+                there = {} if after is None else after.stamps()
+                result.gone.update(folder.stamps().keys() - there)
         self._look_up(watched, result)
         if patrolling:
             self._look_up(self._next_patrol(), result, settled_at=now)
@@ -319,7 +313,7 @@ class Tree:
         for folder in self._folders.values() if linked else ():
             if linked.isdisjoint(folder.rows["inode"].tolist()):
                 continue
-            for path, stamp in folder.stamps.items():
+            for path, stamp in folder.stamps().items():
                 if stamp.inode in linked:
                     links.setdefault((folder.device, stamp.inode), []).append(path)
         second: set[str] = set()
@@ -332,26 +326,28 @@ class Tree:
     def stamps(self) -> Iterator[tuple[str, Stamp]]:
         """The path and the stamp of each file that a scan returned, but for second links."""
         for folder in self._folders.values():
-            for path, stamp in folder.stamps.items():
+            for path, stamp in folder.stamps().items():
                 if path not in self._second_links:
                     yield path, stamp
 
     def stamp(self, path: str) -> Stamp:
         """Returns the stamp of a file that a scan returned."""
-        folder = self._folders.get(_folder_of(path))
-        return UNSEEN if folder is None else folder.stamps_of([path]).get(path, UNSEEN)
+        return self._folder_with(path).stamps([path]).get(path, UNSEEN)
 
     def is_away(self, path: str) -> bool:
         """Returns whether the disk of a file has been unmounted."""
-        folder = self._folders.get(_folder_of(path))
-        return folder is not None and folder.is_away
+        return self._folder_with(path).is_away
 
     def lose(self, path: str) -> None:
         """Makes the next scan report a file as new if it is there."""
-        folder = self._folders.get(_folder_of(path))
-        if folder is not None:
-            folder.newer[path] = UNSEEN
-            folder.trusted = False
+        folder = self._folder_with(path)
+        folder.newer[path] = UNSEEN
+        folder.trusted = False
+
+    def _folder_with(self, path: str) -> _Folder:
+        """Returns the folder of a file, as it was last listed; an empty one if it never was."""
+        folder = _folder_of(path)
+        return self._folders.get(folder) or _Folder(folder, 0, trusted=False)
 
     def _next_patrol(self) -> list[str]:
         """Returns the next files to check, in turn."""
@@ -359,7 +355,7 @@ class Tree:
             self._unpatrolled = self._unpatrolled or [*self._folders]
             while self._unpatrolled and len(self._patrol) < PATROL:
                 folder = self._folders.get(self._unpatrolled.pop())
-                self._patrol += () if folder is None else folder.stamps
+                self._patrol += () if folder is None else folder.stamps()
         following = self._patrol[-PATROL:]
         del self._patrol[-PATROL:]
         return following
@@ -450,7 +446,7 @@ class Tree:
             return known
         folder = _Folder(path, mtime_ns, trusted=settled(mtime_ns, now), device=device)
         folder.read_sidecar()
-        before, stamps = {} if known is None else known.stamps, dict[str, Stamp]()
+        before, stamps = {} if known is None else known.stamps(), dict[str, Stamp]()
         with os.scandir(path) as entries:
             for entry in entries:
                 if self._may_lead_to_bags(entry.path):
@@ -474,38 +470,28 @@ class Tree:
         self, paths: Iterable[str], result: ScanResult, settled_at: Ns | None = None
     ) -> None:
         """Adds the current stamps of files; with `settled_at`, only if they may have changed."""
-        for folder_path, files in groupby(sorted(paths, key=_folder_of), _folder_of):
-            folder, in_folder = self._folders.get(folder_path), [*files]
-            if folder is not None and folder.is_away:
+        unseen = set(paths) - result.stamps.keys() - result.gone
+        for _, files in groupby(sorted(unseen, key=_folder_of), _folder_of):
+            in_folder = [*files]
+            folder = self._folder_with(in_folder[0])
+            if folder.is_away:
                 continue
-            stamps = {} if folder is None else folder.stamps_of(in_folder)
+            before = folder.stamps(in_folder)
             for path in in_folder:
-                if path not in result.stamps and path not in result.gone:
-                    before = stamps.get(path, UNSEEN)
-                    self._look_up_file(path, folder, before, result, settled_at)
-
-    def _look_up_file(
-        self,
-        path: str,
-        folder: _Folder | None,
-        before: Stamp,
-        result: ScanResult,
-        settled_at: Ns | None,
-    ) -> None:
-        try:
-            stamp = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
-        except OSError as error:
-            if _is_gone(error):
-                result.gone.add(path)
-                # The mtime of its folder may be the same, and the file may soon be back.
-                self.lose(path)
-            elif folder is not None:
-                folder.trusted = False
-            return
-        if settled_at is None or stamp != before or not settled(stamp.mtime_ns, settled_at):
-            result.stamps[path] = stamp
-            if folder is not None and stamp != before:
-                folder.newer[path] = stamp
+                try:
+                    stamp = Stamp.of(os.lstat(path), folder.sidecar_ns)
+                except OSError as error:
+                    folder.trusted = False
+                    if _is_gone(error):
+                        result.gone.add(path)
+                        # The mtime of its folder may be the same, and the file may soon be back.
+                        self.lose(path)
+                    continue
+                is_new = stamp != before.get(path)
+                if settled_at is None or is_new or not settled(stamp.mtime_ns, settled_at):
+                    result.stamps[path] = stamp
+                if is_new:
+                    folder.newer[path] = stamp
 
 
 def _is_gone(error: OSError) -> bool:
