@@ -277,12 +277,11 @@ class _Reading:
 
     @property
     def _wanted(self) -> dict[int, Channel]:
-        """The channels of the topics that have messages, by number."""
-        used = self.index.used
+        """The channels of the topics, by number."""
         return {
             number: channel
             for number, channel in self.index.channels.items()
-            if channel.topic in self._topics and number in used
+            if channel.topic in self._topics
         }
 
     def _batches(

@@ -229,12 +229,6 @@ class McapIndex(NamedTuple):
     declared: Declarations | None = None
 
     @property
-    def used(self) -> frozenset[int]:
-        """The channels that have messages."""
-        channel_sets = {chunk.channels for chunk in self.chunks}
-        return frozenset[int]().union(*channel_sets)
-
-    @property
     def memory_bytes(self) -> int:
         """About how much memory it takes, without the channels that files share."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
