@@ -137,16 +137,13 @@ class Typestores:
             text: the definition followed by the nested ones, as rosbag2 concatenates them.
         """
         key = (name, encoding, text)
-        cached = self._types.get(key)
-        if cached is not None:
-            return cached
         # One thread at a time compiles: another that waits here then finds the type.
         with self._lock:
-            cached = self._types.get(key)
-            if cached is None:
-                cached = self._build(name, encoding, text)
-                self._types.put(key, cached, _CACHED_TYPE_BYTES + len(name) + len(text))
-            return cached
+            known = self._types.get(key)
+            if known is None:
+                known = self._build(name, encoding, text)
+                self._types.put(key, known, _CACHED_TYPE_BYTES + len(name) + len(text))
+            return known
 
     def _build(self, name: str, encoding: str, text: bytes) -> MessageType | str:
         root = full_name(name)
