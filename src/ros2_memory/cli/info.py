@@ -1,7 +1,7 @@
 """`ros2-memory topics`, `info` and `recordings`: what is recorded, how much of it, and by whom."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -133,7 +133,7 @@ def _amount_recorded(snapshot: Snapshot) -> JsonObject:
     return amount
 
 
-def storage_of(bags: Sequence[BagFile]) -> str:
+def storage_of(bags: Iterable[BagFile]) -> str:
     """Returns the kinds of bags, as `mcap` or `db3, mcap`."""
     kinds = {bag_kind(bag.path.name) or "" for bag in bags}
     return ", ".join(sorted(kind.removeprefix(".") for kind in kinds))

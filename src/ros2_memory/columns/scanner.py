@@ -34,7 +34,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
@@ -208,7 +208,7 @@ class Scanner:
             self._damaged.clear()
         self._damaged[bag.identity] = error.reason
 
-    def damaged_parts(self, bags: Sequence[BagFile]) -> list[tuple[BagFile, str]]:
+    def damaged_parts(self, bags: Iterable[BagFile]) -> list[tuple[BagFile, str]]:
         """Returns the bags of which a part was found lost since the program began, and why."""
         if not self._damaged:  # else no bag's identity is needed
             return []

@@ -6,9 +6,8 @@ A row takes some 200 bytes. A `BagFile` takes four times as much, so it is made 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
 from itertools import accumulate, chain
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, overload
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -176,8 +175,8 @@ class BagRows:
             yield BagFile(file, size, mtime, _STATES[state], summary, start, end, sidecar)
 
 
-class Bags(Sequence[BagFile]):
-    """The bags of several `BagRows` as one sequence."""
+class Bags:
+    """The bags of several `BagRows`, one after the other."""
 
     def __init__(self, parts: Iterable[BagRows]) -> None:
         self._parts = [*parts]
@@ -192,19 +191,13 @@ class Bags(Sequence[BagFile]):
     def __reversed__(self) -> Iterator[BagFile]:
         return chain.from_iterable(reversed([*part]) for part in reversed(self._parts))
 
-    @overload
-    def __getitem__(self, at: int) -> BagFile: ...
-    @overload
-    def __getitem__(self, at: slice[int | None, int | None]) -> list[BagFile]: ...
-    def __getitem__(self, at: int | slice[int | None, int | None]) -> BagFile | list[BagFile]:
-        if isinstance(at, slice):
-            return [self[nth] for nth in range(len(self))[at]]
-        part, row = self._locate(range(len(self))[at])
+    def __getitem__(self, nth: int) -> BagFile:
+        part, row = self._locate(nth)
         return part[row]
 
-    def recording(self, at: int) -> Path:
+    def recording(self, nth: int) -> Path:
         """Returns the recording of a bag, without making its `BagFile`."""
-        part, row = self._locate(at)
+        part, row = self._locate(nth)
         return folder_path(part.folders[part.folder_of[row]] or "/")
 
     def _locate(self, nth: int) -> tuple[BagRows, int]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.bag_rows import BagRows
+    from ros2_memory.index.bag_rows import BagRows, Bags
     from ros2_memory.storage.base import BagReader
 
 _BLOCK_BYTES: Final = 64 << 10
@@ -76,7 +76,7 @@ class TableChange(NamedTuple):
     """
 
     removed: Sequence[BagFile]
-    added: Sequence[BagFile]
+    added: Bags | Sequence[BagFile]
     is_new: bool
 
 

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.index.bag_rows import Bags
     from ros2_memory.index.segment import Segment, TopicTotals
 
 
@@ -95,7 +96,7 @@ class Snapshot:
     older: Ns | None = None
 
     @property
-    def bags(self) -> Sequence[BagFile]:
+    def bags(self) -> Bags:
         """The bags that answer queries, sorted by (start, end, path).
 
         They are closed, or left open by a crash, and have messages. The bag of carried latched
