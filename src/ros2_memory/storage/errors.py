@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
-    BagContradictionError,
     BagError,
     BagUnreachableError,
     BagVanishedError,
@@ -52,35 +51,32 @@ class UnreachableError(UnreadableError):
     """An `UnreadableError` whose cause is not the file, and may pass."""
 
 
-class LostError(UnreadableError):
-    """Messages that cannot be read, while those around them may be.
+class Lost(NamedTuple):
+    """Stands for messages that cannot be read, while those around them may be.
 
     Attributes:
+        reason: why they cannot be read.
         first: a log time; no lost message is earlier.
         last: a log time; no lost message is later.
+        error: what the reader of the file raises in their place. A `BagContradictionError` says
+            that the messages are read without the file's indexes, and that none is lost.
     """
 
-    def __init__(self, reason: str, first: Ns, last: Ns) -> None:
-        super().__init__(reason)
-        self.first = first
-        self.last = last
+    reason: str
+    first: Ns
+    last: Ns
+    error: type[BagError] = BagError
 
 
-class ContradictionError(LostError):
-    """Indexes that contradict the messages, which are read without them from `first` to `last`."""
-
-
-def raise_if_lost(path: Path, item: T | LostError) -> T:
-    """Returns the item, unless it is an error.
+def raise_if_lost(path: Path, item: T | Lost) -> T:
+    """Returns the item, unless it stands for lost messages of `path`.
 
     Raises:
-        BagContradictionError: the indexes of `path` contradict its messages.
-        BagError: messages of `path` are lost.
+        BagError: it does.
     """
-    if not isinstance(item, LostError):
-        return item
-    error = BagContradictionError if isinstance(item, ContradictionError) else BagError
-    raise error(str(path), str(item), (item.first, item.last))
+    if isinstance(item, Lost):
+        raise item.error(str(path), item.reason, (item.first, item.last))
+    return item
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from ros2_memory.core.model import BAG_KINDS, COMPRESSED, MCAP, SQLITE
 from ros2_memory.storage.base import SEQUENCE, BagReader, Batch, Channel, Definition, Record
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
-    LostError,
+    Lost,
     SizeLimit,
     UnreadableError,
     raise_if_lost,
@@ -251,7 +251,7 @@ class FileReader(BagReader):
     ) -> Iterator[Record]:
         """Yields the undecoded messages of `topics` inside the window, by log time."""
 
-        def read() -> Iterator[Record | LostError]:
+        def read() -> Iterator[Record | Lost]:
             with reading(path), self._open(path) as (bags, file, _):
                 yield from bags.records(file, topics, window, newest_first=newest_first)
 
@@ -268,7 +268,7 @@ class FileReader(BagReader):
     ) -> Iterator[Batch]:
         """Yields the messages of `topics` inside the window, many at once."""
 
-        def read() -> Iterator[Batch | LostError]:
+        def read() -> Iterator[Batch | Lost]:
             with reading(path), self._open(path) as (bags, file, _):
                 yield from bags.batches(file, topics, window, bare)
 

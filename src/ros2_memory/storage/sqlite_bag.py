@@ -23,6 +23,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.core.errors import BagContradictionError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
@@ -43,8 +44,7 @@ from ros2_memory.storage.errors import (
     MAX_NAMES_CHARS,
     MAX_TEXTS_BYTES,
     MAX_TOPICS,
-    ContradictionError,
-    LostError,
+    Lost,
     SizeLimit,
     UnreadableError,
 )
@@ -183,10 +183,10 @@ class SqliteBags:
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record | LostError]:
+    ) -> Iterator[Record | Lost]:
         """Yields the messages of `topics` inside the window, in order.
 
-        An error is yielded first if the indexes of the file are wrong; no message is lost with it.
+        A `Lost` is yielded first if the indexes of the file are wrong; no message is lost with it.
         """
         if window.empty:
             return
@@ -198,7 +198,7 @@ class SqliteBags:
             }
             is_right = self._is_indexed_right(base, declared)
             if not is_right:
-                yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
+                yield Lost(_WRONG_INDEX, window.start, window.stop - 1, BagContradictionError)
             for time, row, number in _ordered_rows(
                 base, wanted, window, newest_first=newest_first, indexed=is_right
             ):
@@ -214,7 +214,7 @@ class SqliteBags:
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str]
-    ) -> Iterator[Batch | LostError]:
+    ) -> Iterator[Batch | Lost]:
         """Yields the messages of `records`, many at once; see `BagReader.batches`."""
         del bare
         if path.stat().st_size > LARGE_BYTES:

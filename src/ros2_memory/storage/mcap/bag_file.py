@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES, BagSummary
+from ros2_memory.core.errors import BagContradictionError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns, Span
 from ros2_memory.storage.base import (
@@ -29,8 +30,7 @@ from ros2_memory.storage.base import (
 )
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
-    ContradictionError,
-    LostError,
+    Lost,
     SizeLimit,
     UnreadableError,
     as_unreadable,
@@ -142,10 +142,10 @@ class McapBags:
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record | LostError]:
+    ) -> Iterator[Record | Lost]:
         """Yields the messages of `topics` inside the window, in order.
 
-        An error is yielded in place of the messages of a damaged chunk, where the first would be.
+        A `Lost` is yielded in place of the messages of a damaged chunk, where the first would be.
         """
         if not window.empty:
             with OpenFile(path) as file:
@@ -153,10 +153,10 @@ class McapBags:
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str]
-    ) -> Iterator[Batch | LostError]:
+    ) -> Iterator[Batch | Lost]:
         """Yields the messages of `records`, many at once; see `BagReader.batches`.
 
-        An error is yielded in place of the messages of a damaged chunk.
+        A `Lost` is yielded in place of the messages of a damaged chunk.
         """
         if not window.empty:
             with OpenFile(path, at_once=window == _EVERYTHING) as file:
@@ -241,7 +241,7 @@ class _Reading:
                 return self._index_without(fault)
         return self.index
 
-    def records(self, *, newest_first: bool) -> Iterator[Record | LostError]:
+    def records(self, *, newest_first: bool) -> Iterator[Record | Lost]:
         """Yields the messages in order, and errors where some are lost."""
         if self.index.contradiction:
             yield self._contradiction()
@@ -254,10 +254,10 @@ class _Reading:
             self._window, read = _split_window(self._window, error.chunk, newest_first=newest_first)
             missed = _missed_span(wrong, self.index, self._wanted, read)
             if missed is not None:
-                yield LostError(str(error), *missed)
+                yield Lost(str(error), *missed)
             yield from merged(self._runs(newest_first=newest_first))
 
-    def batches(self, bare: Collection[str]) -> Iterator[Batch | LostError]:
+    def batches(self, bare: Collection[str]) -> Iterator[Batch | Lost]:
         """Yields the messages many at once, and errors where some are lost."""
         if self.index.contradiction:
             yield self._contradiction()
@@ -270,10 +270,9 @@ class _Reading:
             for chunk in _chunks_of(self.index, self._wanted, self._window):
                 yield from self._batches_of_chunk(chunk, yielded.get(chunk.offset))
 
-    def _contradiction(self) -> ContradictionError:
-        return ContradictionError(
-            self.index.contradiction, self._window.start, self._window.stop - 1
-        )
+    def _contradiction(self) -> Lost:
+        first, last = self._window.start, self._window.stop - 1
+        return Lost(self.index.contradiction, first, last, BagContradictionError)
 
     @property
     def _wanted(self) -> dict[int, Channel]:
@@ -284,9 +283,7 @@ class _Reading:
             if channel.topic in self._topics
         }
 
-    def _batches(
-        self, bare: Collection[str], yielded: dict[int, Chunk]
-    ) -> Iterator[Batch | LostError]:
+    def _batches(self, bare: Collection[str], yielded: dict[int, Chunk]) -> Iterator[Batch | Lost]:
         """Yields the messages of all chunks.
 
         Args:
@@ -322,7 +319,7 @@ class _Reading:
 
     def _batches_of_group(
         self, group: ReadChunks, yielded: dict[int, Chunk]
-    ) -> Iterator[Batch | LostError]:
+    ) -> Iterator[Batch | Lost]:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
         if group.is_read:
             with suppress(UnreadableError, ValueError, IndexError):
@@ -337,7 +334,7 @@ class _Reading:
 
     def _batches_of_chunk(
         self, chunk: Chunk, yielded: Chunk | None = None
-    ) -> Iterator[Batch | LostError]:
+    ) -> Iterator[Batch | Lost]:
         """Yields the messages of one chunk, without those in the indexes of `yielded`.
 
         Raises:
@@ -361,7 +358,7 @@ class _Reading:
     def _batches_of(self, content: ReadChunks, messages: MessageTable) -> Iterator[Batch]:
         return batches_of(content, messages, self._wanted, self._window, self._uncompressed)
 
-    def _runs(self, *, newest_first: bool) -> Iterator[SortedRun[Record | LostError]]:
+    def _runs(self, *, newest_first: bool) -> Iterator[SortedRun[Record | Lost]]:
         """Yields a run for each chunk with messages of the topics.
 
         Raises:
@@ -373,7 +370,7 @@ class _Reading:
         # otherwise be in memory at once.
         read_chunk = lru_cache(1)(self._read_chunk)
 
-        def read_rows(chunk: Chunk) -> RunRows[Record | LostError] | None:
+        def read_rows(chunk: Chunk) -> RunRows[Record | Lost] | None:
             """Returns the wanted messages of a chunk, or the error in their place, if any."""
             read_chunk.cache_clear()  # before the next is decompressed
             try:
@@ -413,7 +410,7 @@ class _Reading:
         first, last = times.searchsorted((self._window.start, min(self._window.stop, MAX_NS)))
         return times[first:last], offsets[first:last]
 
-    def _lost_with(self, chunk: Chunk, reason: str) -> LostError | None:
+    def _lost_with(self, chunk: Chunk, reason: str) -> Lost | None:
         """Returns the error for a chunk that cannot be read; None if it has no wanted message."""
         window = self._window
         first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
@@ -423,7 +420,7 @@ class _Reading:
             if not times.size:
                 return None
             first, last = int(times[0]), int(times[-1])
-        return LostError(reason, first, last)
+        return Lost(reason, first, last)
 
     def _verify_beside(self, verified: Collection[int] = ()) -> None:
         """Compares the chunks beside the window with their records, each once.
