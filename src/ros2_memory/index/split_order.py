@@ -126,14 +126,11 @@ def steps_of(timeline: Timeline) -> list[StepBack]:
 
     Damaged bags are passed over: their times may be wrong.
     """
-    series, numbers = _series_and_numbers(timeline)
     bags, starts, ends = timeline.bags, timeline.starts, timeline.ends
-    order = np.lexsort((numbers, series))
+    order, apart = _in_series(timeline)
     before, after = order[:-1], order[1:]
-    is_next = (series[before] == series[after]) & (series[after] >= 0)
-    is_next &= (numbers[before] >= 0) & (numbers[before] < numbers[after])
     begins = np.minimum(starts[after], MAX_NS - OUT_OF_ORDER_NS)
-    is_late = is_next & (ends[before] > begins + OUT_OF_ORDER_NS)
+    is_late = (apart > 0) & (ends[before] > begins + OUT_OF_ORDER_NS)
     return [
         StepBack(bags[earlier], bags[later], int(ends[earlier]) - int(starts[later]))
         for earlier, later in zip(before[is_late].tolist(), after[is_late].tolist(), strict=True)
@@ -154,11 +151,9 @@ def splits_before_set_ahead(
     has_hole = np.any(starts[1:] - np.maximum.accumulate(ends)[:-1] >= far)
     if not set_ahead and not has_hole:
         return {}
-    series, numbers = _series_and_numbers(timeline)
-    bags, order = timeline.bags, np.lexsort((numbers, series))
+    bags, (order, apart) = timeline.bags, _in_series(timeline)
     before, after = order[:-1], order[1:]
-    is_next = (series[before] == series[after]) & (series[after] >= 0)
-    is_next &= (numbers[before] >= 0) & (numbers[before] + 1 == numbers[after])
+    is_next = apart == 1
     run = np.concatenate(([0], np.cumsum(~is_next)))
     places = np.flatnonzero(is_next & (starts[after] - ends[before] >= far)).tolist()
     steps = [(place, int(starts[after[place]]) - int(ends[before[place]])) for place in places]
@@ -175,10 +170,11 @@ def splits_before_set_ahead(
     return found
 
 
-def _series_and_numbers(timeline: Timeline) -> tuple[Ints, Ints]:
-    """Returns for each bag a code of its series and its number there.
+def _in_series(timeline: Timeline) -> tuple[Ints, Ints]:
+    """Returns the bags in the order of their series, and how far apart their numbers are there.
 
-    The code is -1 for damaged bags, and for bags that are no splits.
+    The second has a number for each two neighbours: 0 if they are not two splits of one series, or
+    if one of them is damaged.
     """
     code_of: dict[Series, int] = {}
     codes, numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -190,7 +186,11 @@ def _series_and_numbers(timeline: Timeline) -> tuple[Ints, Ints]:
         is_damaged = bags.with_schema(attrgetter("is_damaged"))
         codes.append(np.where(is_damaged, -1, np.array(code_of_stem)[bags.names.positions]))
         numbers.append(bags.names.numbers)
-    return np.concatenate(codes), np.concatenate(numbers)
+    series, number = np.concatenate(codes), np.concatenate(numbers)
+    order = np.lexsort((number, series))
+    before, after = order[:-1], order[1:]
+    are_splits = (series[before] == series[after]) & (series[after] >= 0) & (number[before] >= 0)
+    return order, np.where(are_splits, number[after] - number[before], 0)
 
 
 def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
