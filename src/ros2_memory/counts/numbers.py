@@ -29,6 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import rounded_beside
+from ros2_memory.core.text import leaves as leaves_by_path
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
@@ -40,6 +41,7 @@ from ros2_memory.history.reverse_search import note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
+from ros2_memory.messages.conversions import Summary
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -531,7 +533,7 @@ def count_range(
     if by == "value":
         return count_values(view, name, asked, fields=fields)
     binned = BinnedWindow(view, asked, by, (name,))
-    names = tuple(dict.fromkeys(fields))
+    names = number_paths(view, name, fields, asked.stop)
     size = len(binned.bins.names)
     if len(names) * size > MOST_CELLS:
         raise InvalidArgumentsError(
@@ -559,6 +561,29 @@ def count_range(
     note_robots(view, name, binned.counted)
     note_no_fix(view, name, binned.counted, names)
     return binned.answer()
+
+
+def number_paths(view: View, topic: str, fields: Sequence[str], until: Ns) -> tuple[str, ...]:
+    """Returns the dot-paths of the numbers in fields, each once: those in an object one by one.
+
+    The newest message before a log time (ns) shows what a field is.
+    """
+    stored = view.stream.last(topic, until) if fields else None
+    message = None if stored is None else view.bags.decode(stored)
+    paths: dict[str, None] = {}
+    for field in fields:
+        value: JsonValue = None
+        if stored is not None and message is not None:
+            value = view.extractor.exact_at(message, stored.type, field)
+        parts: list[str] = []
+        if isinstance(value, dict) and not isinstance(value, Summary):
+            parts = [
+                path
+                for path, inner in leaves_by_path(value, field)
+                if not isinstance(inner, str | bool)
+            ]
+        paths.update(dict.fromkeys(parts or [field]))
+    return tuple(paths)
 
 
 def _cells_of_fields(

@@ -10,7 +10,13 @@ import numpy as np
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import leaves, listed
-from ros2_memory.counts.numbers import GREATEST, LEAST, PieceNumbers, TooManyError
+from ros2_memory.counts.numbers import (
+    GREATEST,
+    LEAST,
+    PieceNumbers,
+    TooManyError,
+    number_paths,
+)
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View, days_back, open_view
 from ros2_memory.results import Extremes, TypeFields
@@ -107,13 +113,14 @@ def extremes_of(
 ) -> tuple[Extremes, ...]:
     """Returns the extremes of each field (dot-path) of a topic that holds numbers.
 
-    Messages that cannot be decoded do not count, nor do NaN and infinities. If more than
-    `MAX_MESSAGES` would have to be read from bags, there are no extremes, and a note says so.
+    Of an object each number has its own. Messages that cannot be decoded do not count, nor do NaN
+    and infinities. If more than `MAX_MESSAGES` would have to be read from bags, there are no
+    extremes, and a note says so.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    names = tuple(dict.fromkeys(fields))
+    names = number_paths(view, topic, fields, window.stop)
     whole = np.empty(0, np.int64)  # no bounds between bins
     piece_numbers = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
     try:

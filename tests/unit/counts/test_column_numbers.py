@@ -236,3 +236,24 @@ def test_tiny_numbers_keep_their_digits_and_noise_beside_others_does_not(tmp_pat
     assert row["value.mean"] == pytest.approx(1.1667e-5)
     write_numbers(tmp_path, ("Float64", 2.5), ("Float64", 1e-17))
     assert asked(memory, "get_topic_in_range", **given)["extremes"]["value"]["min"] == 0.0
+
+
+@each_way
+def test_numbers_in_an_object_have_extremes_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+    driven = [odom(BEGIN + n * S, x=float(n), y=-2.0 * n, yaw=0.1 * n) for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"start": BEGIN // S, "end": BEGIN // S + 10}
+    given = {"topic": "/odom", **window, "fields": ["position", "orientation"]}
+    extremes = asked(memory, "get_topic_in_range", **given)["extremes"]
+    parts = [f"position.{axis}" for axis in "xyz"]
+    parts += [f"orientation.{turn}_deg" for turn in ("roll", "pitch", "yaw")]
+    assert [*extremes] == parts
+    assert [(extremes[part]["min"], extremes[part]["max"]) for part in parts[:3]] == [
+        (0.0, 4.0),
+        (-8.0, 0.0),
+        (0.0, 0.0),
+    ]
+    columns = asked(memory, "get_topic_in_range", **given, by="day")
+    [row] = (dict(zip(columns["columns"], row, strict=True)) for row in columns["rows"])
+    assert (row["position.x.mean"], row["position.y.min"]) == (2.0, -8.0)
