@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
-from ros2_memory.messages.conversions import INDEX, Summary, names_beside, names_others
+from ros2_memory.messages.conversions import (
+    INDEX,
+    NamedNumber,
+    Summary,
+    names_beside,
+    names_others,
+)
 from ros2_memory.messages.detections import detections_of, without_low_scores
 
 if TYPE_CHECKING:
@@ -109,7 +115,12 @@ class Contains:
         return not self.whole and (self.folded or "").isalpha()
 
     def passes(self, leaf: JsonValue) -> bool:
-        """Returns whether a leaf is a string that has the needle, or the boolean that it means."""
+        """Returns whether a leaf is a string that has the needle, or the boolean that it means.
+
+        A number that is a label has the text of its name.
+        """
+        if isinstance(leaf, NamedNumber):
+            leaf = leaf.name
         if not isinstance(leaf, str):
             return isinstance(leaf, bool) and leaf is self.boolean
         folded = caseless(leaf)
@@ -164,6 +175,8 @@ class Equals:
         """Returns whether a leaf is equal."""
         if isinstance(leaf, bool):
             return leaf is self.boolean
+        if isinstance(leaf, NamedNumber) and self.passes(leaf.name):
+            return True
         if isinstance(leaf, int | float):
             numbers = self.numbers if isinstance(leaf, float) else self.integers
             return any(leaf == number for number in numbers)
@@ -336,8 +349,9 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     for target in condition.targets(value):
         # `leaves` goes through a value from its end.
         for leaf in reversed([*leaves(target)]):
-            if isinstance(leaf, str) and test.passes(leaf):
-                texts[leaf] = None
+            text = leaf.name if isinstance(leaf, NamedNumber) else leaf
+            if isinstance(text, str) and test.passes(text):
+                texts[text] = None
     return tuple(texts)
 
 

@@ -21,7 +21,7 @@ from ros2_memory.analysis.conditions import (
     plain_text,
     positions,
 )
-from ros2_memory.messages.conversions import Summary, names_beside
+from ros2_memory.messages.conversions import NamedNumber, Summary, names_beside
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -82,7 +82,8 @@ def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> 
 
 def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
     """Returns a refusal if all leaves of the targets are of types that the test never takes."""
-    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
+    parts = chain.from_iterable(map(leaves, targets))
+    kinds = {int if isinstance(leaf, NamedNumber) else type(leaf) for leaf in parts}
     wanted = _wanted_kinds(condition, targets)
     if wanted is None or not kinds or kinds & wanted or any(map(_has_unknown_part, targets)):
         return None

@@ -255,13 +255,14 @@ class _LeafTest(NamedTuple):
     @property
     def numbers(self) -> tuple[int | float, ...]:
         """The numbers to which a number of the leaf's kind has to be equal."""
+        named = tuple(number for number, name in self.leaf.names if self.passes(name))
         if isinstance(self.test, Contains):
             equal = self.test.equal if self.is_element else None
         else:
             equal = self.test if isinstance(self.test, Equals) else None
         if equal is None:
-            return ()
-        return equal.numbers if self.leaf.kind is Kind.REAL else equal.integers
+            return named
+        return named + (equal.numbers if self.leaf.kind is Kind.REAL else equal.integers)
 
     @property
     def is_needed(self) -> bool:

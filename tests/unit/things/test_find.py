@@ -463,6 +463,24 @@ def test_tracked_objects_are_things_of_their_likeliest_class_by_its_name(
     ask_labels = {"topic": "/perception/objects", "condition_type": "contains", "by": "label"}
     rows = asked(memory, "find_matches", **ask_labels, value="")["rows"]
     assert [row[:3] for row in rows] == [["9", 1, 19.0], ["CAR", 1, 19.0], ["PEDESTRIAN", 1, 9.0]]
+    for condition_type, value in (
+        ("contains", "pedest"),
+        ("contains_word", "pedestrian"),
+        ("equals", "Pedestrian"),
+    ):
+        told = {"topic": "/perception/objects", "condition_type": condition_type, "value": value}
+        [seen_row] = asked(memory, "find_matches", **told)["sightings"]
+        times = (seen_row["first_seen"] - BEGIN, seen_row["last_seen"] - BEGIN)
+        assert (times, seen_row["matched"]) == ((5, 14), ["PEDESTRIAN"])
+        assert asked(memory, "find_last_match", **told)["timestamp"] == BEGIN + 14
+    told = {"topic": "/perception/objects", "field": "objects.classification.label"}
+    numbers = {**told, "condition_type": "equals"}
+    assert asked(memory, "find_last_match", **numbers, value=7)["timestamp"] == BEGIN + 14
+    assert asked(memory, "find_last_match", **numbers, value=3) is None
+    assert (
+        "one of UNKNOWN = 0, CAR = 1"
+        in asked(memory, "find_matches", **numbers, value="bus")["detail"]
+    )
 
 
 def test_two_of_a_kind_one_above_the_other_are_two_though_no_message_has_both(
