@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.core.errors import BagError, InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import abbreviate, listed
+from ros2_memory.messages.conversions import constants_of_field
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _CONSTANT: Final = re.compile(
 """A constant that is a whole number, in the text of a message definition, or in IDL."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = rf"^[ \t]*(?:{_INTEGER}|float[0-9]*|double)[ \t]+{{}}\b"
+_ANY_NUMBER_FIELD: Final = re.compile(_NUMBER_FIELD.format("([a-z][a-z0-9_]*)"), re.MULTILINE)
 _SEPARATOR: Final = re.compile(r"^={40,}[ \t]*$", re.MULTILINE)
 """A line between the definitions of a type and of its parts."""
 _MOST_CONSTANTS: Final = 16
@@ -65,9 +67,15 @@ def _constants_of(schema: Schema, path: str) -> list[tuple[str, str]]:
 
 
 def _constants_beside(schema: Schema, path: str) -> list[tuple[str, str]]:
-    """Returns the constants of the parts of a definition that have the number at a dot-path."""
-    parts = [part for part in _SEPARATOR.split(_text_of(schema)) if _has_number(part, path)]
-    return [constant for part in parts for constant in _CONSTANT.findall(part)]
+    """Returns the constants of the number at a dot-path; of every number for an empty path."""
+    _, _, name = path.rpartition(".")
+    constants: list[tuple[str, str]] = []
+    for part in _SEPARATOR.split(_text_of(schema)):
+        if _has_number(part, path):
+            fields, of_part = _ANY_NUMBER_FIELD.findall(part), _CONSTANT.findall(part)
+            for field in [name] if name else fields:
+                constants += constants_of_field(field, fields, of_part)
+    return constants
 
 
 def _has_number(text: str, path: str) -> bool:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
+T = TypeVar("T")
 V = TypeVar("V")
 
 ABSENT: Final = object()
@@ -305,20 +306,37 @@ def label_names(
 ) -> Mapping[str, Mapping[int, str]]:
     """Returns the names of the numbers of each field that has a label, by the type's constants.
 
-    Where constants begin with the name of the field (`LABEL_CAR`), these count alone, without it. A
+    Where constants begin with the name of the field (`LABEL_CAR`), that is no part of the name. A
     number of several constants has no name.
     """
+    names = [*fields] if constants else []
     named: dict[str, Mapping[int, str]] = {}
-    for field in fields if constants else ():
-        if field not in LABELS:
-            continue
-        prefix = f"{field.upper()}_"
-        own = [
-            (name[len(prefix) :], number) for name, number in constants if name.startswith(prefix)
-        ]
-        counts = Counter(number for _, number in own or constants)
-        named[field] = {number: name for name, number in own or constants if counts[number] == 1}
+    for field in LABELS:
+        if field in names:
+            own = constants_of_field(field, names, constants)
+            counts = Counter(number for _, number in own)
+            named[field] = {
+                number: name.removeprefix(_prefix(field))
+                for name, number in own
+                if counts[number] == 1
+            }
     return named
+
+
+def constants_of_field(
+    field: str, fields: Iterable[str], constants: Sequence[tuple[str, T]]
+) -> list[tuple[str, T]]:
+    """Returns the constants of a type that may be values of one of its fields.
+
+    They begin with the name of the field (`LABEL_CAR`), else with that of no field.
+    """
+    own = [constant for constant in constants if constant[0].startswith(_prefix(field))]
+    of_others = tuple(map(_prefix, fields))
+    return own or [constant for constant in constants if not constant[0].startswith(of_others)]
+
+
+def _prefix(field: str) -> str:
+    return f"{field.upper()}_"
 
 
 def _with_name(names: Mapping[int, str], _message: object, value: object) -> object:

@@ -354,6 +354,8 @@ def test_a_constant_stands_for_the_number_that_each_type_of_a_topic_gives_it(
             "numbers of old_msgs/msg/Winch: STATE_IDLE = 1, STATE_HAULING = 4, STATE_BROKEN = 5",
             "numbers of winch_msgs/msg/Winch: STATE_IDLE = 0, STATE_HAULING = 2",
         ]
+    notes = asked(memory, "get_topic_in_range", **{**window, "fields": ["cable"]}, changes=True)
+    assert "numbers of" not in str(notes)
     named = r"must be a number, or one of STATE_IDLE = 0, STATE_HAULING = 2$"
     with pytest.raises(InvalidArgumentsError, match=named):
         last(memory, "equals", "STATE_PAYING", "/winch", field="state")

@@ -246,6 +246,7 @@ def test_detections_of_a_low_score_leave_their_places_empty() -> None:
 def test_constants_of_its_type_name_the_numbers_of_a_label() -> None:
     classes = [("CAR", 1), ("TRUCK", 2), ("LORRY", 2)]
     assert label_names(["label", "size"], classes) == {"label": {1: "CAR"}}
+    assert label_names(["label", "size"], [*classes, ("SIZE_LARGE", 3)])["label"] == {1: "CAR"}
     own = [("SHAPE_BOX", 0), ("LABEL_CAR", 0), ("LABEL_TRUCK", 1)]
     assert label_names(["label"], own) == {"label": {0: "CAR", 1: "TRUCK"}}
     assert label_names(["mode"], own) == {}
