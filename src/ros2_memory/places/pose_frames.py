@@ -31,8 +31,9 @@ from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import Place, names_by_size
 from ros2_memory.core.spans import Spans, spans_of, without
-from ros2_memory.core.text import abbreviate, counted
-from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.text import Reason, abbreviate, counted
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import (
     body_by_transforms,
@@ -66,6 +67,12 @@ WHEREABOUTS: Final = "where the robot was"
 """What notes say is not known without poses."""
 NEWEST_POSE_NS: Final = SILENCE_NS
 """After so long without a pose the robot may have moved."""
+_OLD_NS: Final = NS_PER_S
+_OLD_PERIODS: Final = 3
+"""A pose is old after so long, and so many times the time since the one before it."""
+_OLD: Final = Reason(
+    "the newest pose was old, and the robot may have been elsewhere", "time", of="at "
+)
 
 
 def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
@@ -144,8 +151,19 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     in_frame = pose_if_placed(view, pose, stored.time, stored.recording, frame_id)
     if in_frame is None:
         return None
+    _note_old(view, at, stored)
     view.notes.add(*axes_of(in_frame.frame_id))
     return with_place(view, in_frame, stored.time, stored.recording)
+
+
+def _note_old(view: View, at: Ns, newest: StoredMessage) -> None:
+    """Notes if the newest pose is old: it is not known how far the robot was from there."""
+    age = at - newest.time
+    if age <= _OLD_NS:
+        return
+    before = view.stream.last(newest.topic, newest.time)
+    if before is not None and age > _OLD_PERIODS * (newest.time - before.time):
+        view.notes.add(Note(_OLD, unix_text(at), f"{unix_from_ns(age):.1f} s"))
 
 
 def pose_in_map(

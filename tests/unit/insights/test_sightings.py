@@ -302,6 +302,24 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
     assert newest("/rosout", "OK", field="status.level")["error"] == "invalid_arguments"
 
 
+@pytest.mark.parametrize(("period_s", "is_old"), [(0.1, True), (2.0, False)])
+def test_a_pose_of_seconds_before_is_said_to_be_old_unless_poses_are_rare(
+    tmp_path: Path, *, period_s: float, is_old: bool
+) -> None:
+    """As of a robot that lost itself while it drove."""
+    driven = [
+        odom(BEGIN + round(n * period_s * S), x=n * period_s) for n in range(round(20 / period_s))
+    ]
+    bumps = [boolean(BEGIN + n * S, n in {10, 23}, "/bumper") for n in range(30)]
+    memory = remembered(tmp_path, [*driven, *bumps])
+    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    found = asked(memory, "find_matches", **bumped)
+    assert [row["first_seen"] - T0 for row in found["sightings"]] == [23, 10]
+    notes = [note for note in found.get("notes", []) if "newest pose was old" in note]
+    assert bool(notes) == is_old
+    assert all(note.startswith(f"at {T0 + 23}.000000 the newest pose was old") for note in notes)
+
+
 @each_way
 @pytest.mark.parametrize("split_s", [7.0, 1000.0])
 def test_diagnostics_of_one_node_go_on_while_others_report(
