@@ -66,6 +66,7 @@ from ros2_memory.things.instances import Instance, Move, Mover, PlacedStay, most
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import (
+    blind_notes,
     crowded_notes,
     describe_hung,
     look_alike_notes,
@@ -254,6 +255,7 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     things = known_things(
         view, limits.min_score, TimeWindow(earlier.start, max(earlier.stop, later.stop))
     )
+    view.notes.add(*blind_notes(things, (earlier, later)))
     note_other_frames(view, things, where)
     epochs = [instance.epoch for instance in things.estimate.instances]
     frame = things.frames[epochs[0] if epochs else 0]

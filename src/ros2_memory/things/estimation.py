@@ -27,6 +27,7 @@ from ros2_memory.core.arrays import (
     rows_by,
     stable_order,
 )
+from ros2_memory.things.blindness import seeing_messages, without_blind
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -80,6 +81,10 @@ def estimate(
     again; its errors end the estimate.
     """
     observed = Observations(sights, labels, min_score, go_on)
+    seeing, blind_times = seeing_messages(observed, labels)
+    if blind_times:
+        sights = without_blind(sights, seeing)
+        observed = Observations(sights, labels, min_score, go_on)
     names = _names_to_show(sights, labels)
     keys = with_synonyms(sights, observed.counts, labels, go_on)
     groups = groups_in(observed, keys)
@@ -103,6 +108,7 @@ def estimate(
         scores=Tally.of(len(sights.spots), *scores),
         hits=observed.hits,
         looks=observed.cells.looks,
+        blind=blind_times,
         instances=instances,
         movers=movers,
         counts=observed.counts,

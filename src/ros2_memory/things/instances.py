@@ -157,6 +157,14 @@ class Tally(NamedTuple):
         return end - begin, self.what[rows].astype(np.int64), self.n[rows].astype(np.int64)
 
 
+class BlindTime(NamedTuple):
+    """A time [first, last] (ns) in which a detector saw nothing of what is usual in its view."""
+
+    topic: str
+    first: Ns
+    last: Ns
+
+
 @dataclass(slots=True)
 class Estimate:
     """The things in sights, sorted by label and place, and the columns of sights for answers.
@@ -168,7 +176,8 @@ class Estimate:
         unplaced: the detections without a place.
         scores: for each spot, how many detections that count have a score in each bin.
         hits: for each spot, how often it was seen in each of `looks`.
-        looks: the looks of the detectors.
+        looks: the looks of the detectors, but of blind ones.
+        blind: when a detector was blind.
         instances: the things that stay where they are for a while.
         movers: the things that move by themselves.
     """
@@ -180,6 +189,7 @@ class Estimate:
     scores: Tally
     hits: Tally
     looks: Looks
+    blind: list[BlindTime]
     instances: list[Instance]
     movers: list[Mover]
     counts: Ints

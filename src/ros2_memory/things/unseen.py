@@ -201,6 +201,20 @@ def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
                 )
 
 
+def blind_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator[str]:
+    """Yields a sentence for each detector that was blind in some windows."""
+    spans: dict[str, list[str]] = {}
+    for blind in known.by_all.estimate.blind:
+        if any(blind.first < window.stop and blind.last >= window.start for window in windows):
+            span = f"from {unix_text(blind.first)} to {unix_text(blind.last)}"
+            spans.setdefault(blind.topic, []).append(span)
+    for topic, of_topic in spans.items():
+        yield (
+            f"{topic} detected nothing {listed(of_topic)}, also where it otherwise does, as in the "
+            "dark: these are no looks"
+        )
+
+
 def _hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     """Returns the stamp (ns) of an old message that the newest messages of a window repeat.
 
@@ -333,6 +347,7 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
             "searches text"
         )
     yield from crowded_notes(known)
+    yield from blind_notes(known, (question.window,))
     yield from vague_notes(known, (question.window,), question.labels, question.vague)
     if not question.labels:
         yield from unplaced_notes(known, (question.window,))
@@ -541,6 +556,7 @@ def _silence_notes(view: View, known: KnownThings, question: ThingsQuestion) -> 
     topics = [topic for topic in known.estimate.topics if topic not in question.undecoded]
     # Each new message of a detector is a look.
     is_empty = not ((looks.first < window.stop) & (looks.last >= window.start)).any()
+    is_empty &= not [*blind_notes(known, (window,))]
     if topics and is_empty and known.reaches_back(window):
         yield (
             f"{listed(topics)} published nothing new in this window: whether things were there "

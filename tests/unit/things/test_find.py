@@ -837,6 +837,45 @@ def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
     assert "no things are known" not in str(found)
 
 
+BENCH: list[Seen] = [("cup", 3.0, 0.5), ("kettle", 3.0, -0.5), ("tray", 3.0, 0.0)]
+
+
+def dark(start: int, stop: int) -> list[Msg]:
+    """It stands before the bench for half a minute, turns to the crate, and so on."""
+    turns = (looked(at, at + 30, HERE if at % 60 < 30 else AWAY) for at in range(start, stop, 30))
+    return [*chain.from_iterable(turns)]
+
+
+@pytest.mark.parametrize("later", [BENCH, []], ids=["light again", "still dark"])
+def test_in_the_dark_nothing_is_missed(tmp_path: Path, later: list[Seen]) -> None:
+    """The detector publishes empty messages, as the robot stands and turns."""
+    crate = ("crate", -2.0, 0.0)
+    seen = [*looked(0, 30, AWAY, crate, ("pot", -2.0, 0.6)), *looked(30, 61, HERE, *BENCH)]
+    reply = told_of(tmp_path, [*seen, *dark(61, 601), *looked(610, 640, HERE, *later)])
+    found = {thing["label"]: thing for thing in reply["things"]}
+    assert found.keys() == {"crate", "cup", "kettle", "pot", "tray"}
+    assert not any("moved_times" in thing for thing in found.values())
+    assert not any("not_seen_where_expected" in thing["still_there"] for thing in found.values())
+    [blind] = [note for note in reply["notes"] if "detected nothing" in note]
+    assert blind.startswith(f"/vision/scene/scene_objects detected nothing from {BEGIN + 70}")
+    windows = {"with_start": BEGIN, "with_end": BEGIN + 59, "start": BEGIN + 70, "end": BEGIN + 600}
+    compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows)
+    assert "not_seen_where_expected" not in compared["things"]
+    assert blind in compared["notes"]
+
+
+def test_what_was_taken_away_one_by_one_is_missed_on_an_empty_bench(tmp_path: Path) -> None:
+    messages = [
+        *looked(0, 30, HERE, *BENCH),
+        *looked(30, 60, HERE, *BENCH[:2]),
+        *looked(60, 90, HERE, *BENCH[:1]),
+        *looked(90, 150, HERE),
+    ]
+    reply = told_of(tmp_path, messages)
+    assert len(reply["things"]) == 3
+    assert all("not_seen_where_expected" in thing["still_there"] for thing in reply["things"])
+
+
 @pytest.mark.parametrize("repeated", [(), (("crate", 3.0, 0.0),)], ids=["nothing", "a crate"])
 def test_a_detector_that_repeats_one_message_looks_at_nothing(
     tmp_path: Path, repeated: Sequence[Seen]
