@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Condition, Contains, Equals
+from ros2_memory.analysis.conditions import Condition, Contains, Equals, at_field
 from ros2_memory.analysis.facts import FLAG, has_errors, has_events
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, IntervalTable
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events, joined_visible
@@ -59,12 +59,13 @@ from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before, message_before
+from ros2_memory.messages.detections import naming_fields
 from ros2_memory.places.where import Scope, Where, heard_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.model import JsonValue
@@ -178,8 +179,7 @@ def _held_by_events(
         if len(types) > 1 or len(topics) > 1:
             return None
         return _boolean_held(binned, topics[0], condition, scope, wanted=wanted)
-    may_be_label = isinstance(value, str) and condition.field is None
-    if not may_be_label or any(map(has_errors, types)):
+    if any(map(has_errors, types)) or not (condition.field or isinstance(value, str)):
         return None
     return _label_held(binned, topics, condition, scope)
 
@@ -252,8 +252,18 @@ def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> Non
 def _label_held(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
 ) -> SightingSpans | None:
-    """Returns when a thing was in view whose label meets a condition; None if no label does."""
-    view, matches = binned.view, Condition(condition.test).matches
+    """Returns when a thing was in view whose label meets a condition; None if no label does.
+
+    Nor if the condition is on a field that is not the label.
+    """
+    view, field = binned.view, condition.field
+    if field and not all(_is_label(view, topic, field, binned.counted) for topic in topics):
+        return None
+    on_label = Condition(condition.test)
+
+    def matches(label: str) -> bool:
+        return on_label.matches(label) or (label.isdecimal() and on_label.matches(int(label)))
+
     if scope.is_bounded or condition.min_score or len(topics) > 1:
         seen = read_labels(view, topics, scope, condition, matches)
         visible, since = seen.visible, seen.since
@@ -276,6 +286,29 @@ def _label_held(
     )
     start = binned.counted.start
     return SightingSpans(held_spans((first, last, first >= start) for first, last in spans), since)
+
+
+def _is_label(view: View, topic: str, field: str, window: TimeWindow) -> bool:
+    """Returns whether a field names what is seen, by the last message in which anything was."""
+    holder, _, name = field.rpartition(".")
+    for _, part in events_back(view, topic, window):
+        lasts = [interval.last for interval in part.visible.intervals()]
+        if lasts:
+            seen = view.stream.newest(topic, TimeWindow(window.start, max(lasts) + 1))
+            value = None if seen is None else view.value(seen)
+            objects = at_field(value, holder) if holder else [value]
+            return any(
+                next((own for own in naming_fields(found) if own in found), None) == name
+                for found in _objects_in(objects)
+            )
+    return False
+
+
+def _objects_in(values: Sequence[JsonValue]) -> Iterator[dict[str, JsonValue]]:
+    """Yields the objects among values, and in lists among them."""
+    for value in values:
+        elements = value if isinstance(value, list) else [value]
+        yield from (element for element in elements if isinstance(element, dict))
 
 
 def _visible_by_events(

@@ -1,6 +1,7 @@
 """Counts by times of the clock, and by labels as the messages say that the test wrote."""
 
 import json
+from collections.abc import Callable
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +18,19 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, TimeBins, time_bins
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import boolean, detections, log_entry, odom, text, write_mcap, write_splits
+from tests.support.bags import (
+    Msg,
+    boolean,
+    detected,
+    detections,
+    header,
+    log_entry,
+    make,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.clocks import in_zone
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
@@ -389,6 +402,40 @@ def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, recalls: bool) -
         assert [each["count"] for each in answer["sightings"]] == [20]
         newest = asked(memory, "find_last_match", **sought)
         assert newest["timestamp"] == T + 19
+
+
+def tags(at: int, *numbers: int) -> Msg:
+    kind = "apriltag_msgs/msg/AprilTagDetection"
+    seen = [make(kind, family="tag36h11", id=each, decision_margin=60.0) for each in numbers]
+    name = "apriltag_msgs/msg/AprilTagDetectionArray"
+    found = make(name, header=header(at, "camera"), detections=seen)
+    return Msg("/detections", name, at, found)
+
+
+def cups(at: int, *numbers: int) -> Msg:
+    things = [("cup" if each == 7 else "pot", 0.9, (1.0, 0.0, 0.0)) for each in numbers]
+    return detected(at, things, topic="/detections")
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("write_seen", "field", "value"),
+    [(tags, "detections.id", 7), (cups, "detections.label", "cup")],
+    ids=["tag", "label"],
+)
+def test_a_thing_that_a_detector_misses_for_a_moment_counts_once(
+    tmp_path: Path, recalls: bool, write_seen: Callable[..., Msg], field: str, value: str | int
+) -> None:
+    """Two visits of 30 s, in which every fifth message misses it: the field names what is seen."""
+    seen = [
+        write_seen((T + at) * NS_PER_S, *([4] if at % 5 == 2 else [4, 7] if at % 60 < 30 else []))
+        for at in range(120)
+    ]
+    write_splits(tmp_path, seen, 40)
+    memory = memory_of(tmp_path, recalls=recalls)
+    sought = {"topic": "/detections", "condition_type": "equals", "field": field, "value": value}
+    whole = table(asked(memory, "find_matches", **sought, by="day"))["all"]
+    assert (whole["count"], whole["seconds"]) == (2, pytest.approx(58, abs=4))
 
 
 @each_way
