@@ -407,12 +407,15 @@ class _ThingsBetween:
             if missed is None or missed >= self.later.stop:
                 return "not_looked_at", thing
             return "not_seen_where_expected", replace(thing, missed=missed, looks=looks)
-        if before is None or after is None or before.is_elsewhere(after):
+        if before is None or after is None:
             return "moved", thing
-        if before.at_once == after.at_once:
-            return "same", thing
-        was, now = (replace(stay.part, at_once=stay.at_once) for stay in (before, after))
-        return "more_or_fewer", replace(thing, before=was, after=now)
+        is_number_equal = before.at_once == after.at_once
+        if not is_number_equal:
+            was, now = (replace(stay.part, at_once=stay.at_once) for stay in (before, after))
+            thing = replace(thing, before=was, after=now)
+        if before.is_elsewhere(after):
+            return "moved", thing
+        return "same" if is_number_equal else "more_or_fewer", thing
 
     def _last_stay(
         self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS

@@ -109,7 +109,7 @@ def find_things(
     if nearness is not None:
         landmarks = nearness.landmarks(finder)
         found = [*nearness.select(found, landmarks)]
-        view.notes.add(*nearness.describe_lack(found, landmarks))
+        view.notes.add(*nearness.describe_lack(memory.limits, found, landmarks))
         if nearness.label and not landmarks:
             wanted[known.labels.key(nearness.label)] = nearness.label
     note_unread(view, asked_window, nothing=not found, gaps=not found)
@@ -275,11 +275,17 @@ class Near(NamedTuple):
         ]
 
     def describe_lack(
-        self, found: Sequence[_FoundThing], landmarks: Sequence[_FoundThing]
+        self,
+        limits: QuerySettings,
+        found: Sequence[_FoundThing],
+        landmarks: Sequence[_FoundThing],
     ) -> Iterator[str]:
         """Yields why nothing was found near the point or the landmarks."""
         if self.label and not landmarks:
             yield f"near: there is no thing {abbreviate(self.label)} in this window"
+            with suppress(InvalidArgumentsError):
+                parse_where(limits, self.label)
+                yield f"{abbreviate(self.label)} is a place: ask with it as where"
         elif not found:
             within = f"within {self.circle.radius_m:g} m"
             yield f"near: nothing is {within} of it; for more give a larger radius_m"

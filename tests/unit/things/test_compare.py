@@ -70,6 +70,16 @@ def test_things_that_stand_together_are_compared_by_their_number(tmp_path: Path)
     assert (same["things"], same["things_unchanged"]) == ({}, 1)
 
 
+def test_of_two_that_stood_together_one_is_missing_where_the_other_is_now(tmp_path: Path) -> None:
+    two, one = [("cup", 3.0, 0.0), ("cup", 3.0, 0.25)], ("cup", 3.0, -1.5)
+    reply = compared(tmp_path, [*looked(0, 30, HERE, *two), *looked(60, 90, HERE, one)])
+    [moved] = reply["things"]["moved"]
+    assert (moved["was"]["at_once"], moved["is"]["at_once"]) == (2, 1)
+    reply = compared(tmp_path / "one", [*looked(0, 30, HERE, two[0]), *looked(60, 90, HERE, one)])
+    [moved] = reply["things"]["moved"]
+    assert "at_once" not in moved["was"] | moved["is"]
+
+
 def test_one_more_that_came_since_the_visit_before_stands_beside_the_other(tmp_path: Path) -> None:
     """Although it was not there in most of the times that the robot looked."""
     cup, came = ("cup", 3.0, 0.0), ("cup", 3.0, 0.25)

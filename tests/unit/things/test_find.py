@@ -794,6 +794,13 @@ def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path) -> None:
         assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
 
 
+def test_a_place_that_is_given_as_near_is_said_to_be_one(tmp_path: Path) -> None:
+    write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.0)))
+    assert '"Kitchen" is a place: ask with it as where' in ask(tmp_path, near="Kitchen")["notes"]
+    assert [thing["label"] for thing in ask(tmp_path, where="Kitchen")["things"]] == ["cup"]
+    assert not any("is a place" in note for note in ask(tmp_path, near="hall")["notes"])
+
+
 @in_zone("UTC")
 def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
     """Every morning on the table, every afternoon elsewhere, for two weeks."""
