@@ -257,10 +257,11 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
         view.notes.add(f"{pair.describe_by_clock(topic)}: the path there is that of {before}")
 
 
-def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
+def note_robots(view: View, topic: str, window: TimeWindow, *, places: bool = False) -> Spans:
     """Notes recordings with different messages on a topic at the same time, and times held twice.
 
-    Returns these times, without the overlaps of two recordings that a clock explains.
+    With `places` the answer has what was seen, which has no place in a time held twice. Returns
+    these times, without the overlaps of two recordings that a clock explains.
     """
     parallel = parallel_or_twice(view, topic, window)
     names = _recording_names(view, [pair for pair in parallel if not pair.by_clock])
@@ -271,7 +272,13 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
         )
     for pair in parallel:
         if pair.by_clock:
-            view.notes.add(f"{pair.describe_by_clock(topic)}: the answer does not separate the two")
+            is_left_out = places and pair.is_twice
+            what = (
+                "what was seen then has no place"
+                if is_left_out
+                else "the answer does not separate the two"
+            )
+            view.notes.add(f"{pair.describe_by_clock(topic)}: {what}")
     spans = [pair.span for pair in parallel if pair.is_twice or not pair.by_clock]
     return united((span.start, span.stop) for span in spans)
 
@@ -297,7 +304,7 @@ def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[Parall
     if topic not in view.timeline.transient_local:
         parallel += _parallel_recordings(view, topic, window) or ()
     holding = view.timeline.recordings(topic)
-    parallel += (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
+    parallel += (pair for pair in times_recorded_twice(view, window) if pair.first in holding)
     return parallel
 
 
@@ -349,13 +356,17 @@ def _parallel_recordings(
 
 def note_times_twice(view: View, window: TimeWindow) -> None:
     """Notes which recordings have a time of a window twice, for what has the messages of both."""
-    for pair in _times_recorded_twice(view, window):
+    for pair in times_recorded_twice(view, window):
         view.notes.add(f"{pair.describe_by_clock('')}: both are here, mixed in the order of time")
 
 
-def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
+def note_robots_on(
+    view: View, topics: Sequence[str], window: TimeWindow, *, places: bool = False
+) -> Spans:
     """Does `note_robots` for the first few topics; returns the times of all."""
-    spans_by_topic = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
+    spans_by_topic = [
+        note_robots(view, topic, window, places=places) for topic in topics[:_MAX_TOPICS]
+    ]
     return united(chain.from_iterable(spans_by_topic))
 
 
@@ -363,7 +374,7 @@ def note_robots_near(view: View, stored: StoredMessage) -> None:
     """Does `note_robots` around a message, if recordings overlap there."""
     topic, at = stored.topic, stored.time
     pairs = _overlapping_pairs(view, topic, TimeWindow.around(at, _NEAR_NS))
-    if any(chain(pairs, _times_recorded_twice(view, TimeWindow(at, at + 1)))):
+    if any(chain(pairs, times_recorded_twice(view, TimeWindow(at, at + 1)))):
         note_robots(view, topic, TimeWindow.around(at, _NEAR_NS))
 
 
@@ -436,7 +447,7 @@ def _is_short_edge(earlier: _TopicSpan, later: _TopicSpan) -> bool:
     return is_edge and 2 * (earlier.last - later.first) < shortest
 
 
-def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
+def times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields the recordings in which the clock was set back, with the bags after that.
 
     Within a bag the moment is known only to the period of its fastest topic, and which messages are

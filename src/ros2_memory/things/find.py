@@ -97,7 +97,8 @@ def find_things(
         raise InvalidArgumentsError(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
-    note_robots_on(view, [view.pose_topic] if view.has_poses else view.moving_topics, window)
+    topics = [view.pose_topic] if view.has_poses else view.moving_topics
+    note_robots_on(view, topics, window, places=True)
     undecoded = note_undecoded(view, window)
     view.notes.add(*describe_hung(view, window))
     known = known_things(view, lowest, window)

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
-_NEAR_NS: Final[Ns] = NS_PER_S
+NEAR_NS: Final[Ns] = NS_PER_S
 """Farther from a pose in time, the robot's place is unknown."""
 _FIX_NS: Final[Ns] = 2 * NS_PER_S
 """The time between fixes of odometry in the map."""
@@ -427,8 +427,8 @@ def _pose_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
     start, stop = poses.times[before], poses.times[after]
     ratio = np.clip((times - start) / np.maximum(stop - start, 1), 0.0, 1.0)
-    is_known = np.minimum(np.abs(times - start), np.abs(stop - times)) <= _NEAR_NS
-    is_known &= (stop - start <= 2 * _NEAR_NS) & placed.valid
+    is_known = np.minimum(np.abs(times - start), np.abs(stop - times)) <= NEAR_NS
+    is_known &= (stop - start <= 2 * NEAR_NS) & placed.valid
     begin, end = poses.positions[before], poses.positions[after]
     x, y, z = (begin + (end - begin) * ratio[:, None]).T
     heading = headings(poses.turns)

@@ -25,11 +25,13 @@ from ros2_memory.core.arrays import bounds_of, in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import spans_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.robots import times_recorded_twice
 from ros2_memory.history.scan import open_scan, remembered, scan
-from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
+from ros2_memory.things.placing import AROUND_NS, LOCALISER, NEAR_NS, Placer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.scan import Scan
@@ -477,7 +479,17 @@ class SightReader:
         limits, body = self._view.limits, self._placer.body
         placed_by = body or self._view.pose_topic
         settings = (limits.map_frame, placed_by, limits.tf_topics, limits.tf_clock)
-        return _hashed((VERSION, settings, transforms, sessions))
+        twice = [(folder.name, at.start, at.stop) for folder, at in self._twice_in(window)]
+        return _hashed((VERSION, settings, transforms, sessions, twice))
+
+    def _twice_in(self, window: TimeWindow) -> list[tuple[Path, TimeWindow]]:
+        """Returns the recordings that have times around a window twice, with these times.
+
+        Which poses belong to what was seen then is not known.
+        """
+        reach = window.widened(AROUND_NS)
+        pairs = times_recorded_twice(self._view, reach)
+        return [(pair.first, pair.span.widened(NEAR_NS).intersect(reach)) for pair in pairs]
 
     def _read(self, around: _Surroundings) -> Seen:
         """Returns what was seen in a stretch by its messages."""
@@ -506,10 +518,22 @@ class SightReader:
         return Seen(tuple(stretches))
 
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
-        """Yields the rows in a window that may have detections."""
+        """Yields the rows in a window that may have detections, but not of times that are twice."""
+        twice = self._twice_in(window)
         for topic in self._topics:
             scanned = scan(self._view, topic, window, may_match=self._placer.rows.columns.may_match)
-            yield from filter(self._placer.rows.may_have_any, scanned)
+            for rows in filter(self._placer.rows.may_have_any, scanned):
+                once = _rows_once(rows, twice)
+                if len(once):
+                    yield once
+
+
+def _rows_once(rows: Rows, twice: Sequence[tuple[Path, TimeWindow]]) -> Rows:
+    """Returns the rows without those of times that their recording has twice."""
+    spans = [span for recording, span in twice if recording == rows.recording]
+    if not spans:
+        return rows
+    return rows.some(np.flatnonzero(~np.any([span.holding(rows.times) for span in spans], axis=0)))
 
 
 def _rows_in_slices(rows: Rows, slices: Sequence[int], start: Ns) -> Rows:

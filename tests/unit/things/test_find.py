@@ -39,6 +39,7 @@ from tests.support.bags import (
     tf,
     tracked,
     transform,
+    write_mcap,
     write_splits,
 )
 from tests.support.clocks import in_zone
@@ -663,6 +664,26 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
         [thing] = [thing for thing in reply["things"] if thing["label"] == each]
         assert "moved" not in thing
     assert ask(tmp_path / "moved", QuerySettings())["labels"] == {"mug": 1}
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_what_was_seen_in_a_time_that_a_recording_has_twice_has_no_place(
+    tmp_path: Path, stored: bool
+) -> None:
+    """The clock was set back by a minute: poses of both minutes lie between each other."""
+    first = looked(0, 120, HERE, ("cup", 3.0, 0.5))
+    second = looked(60, 240, (11.0, 0.0, math.pi / 2), ("plant", 11.5, 3.0))
+    write_mcap(tmp_path / "run" / "run_0.mcap", first)
+    write_mcap(tmp_path / "run" / "run_1.mcap", second)
+    memory = memory_of(tmp_path, limits=NAMED)
+    reply = asked(with_store(memory, tmp_path) if stored else memory, "find_things")
+    places = {
+        thing["label"]: (thing["place"]["x"], thing["place"]["y"]) for thing in reply["things"]
+    }
+    assert reply["labels"] == {"cup": 1, "plant": 1}
+    assert places == {"cup": (3.0, 0.5), "plant": (11.5, 3.0)}
+    assert all("moved" not in thing for thing in reply["things"])
+    assert "twice, as the clock was set back meanwhile: what was seen then has no" in str(reply)
 
 
 GUESS = "which one of a label moved is a guess, since others of it came or went meanwhile: "
