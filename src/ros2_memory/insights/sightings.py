@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
+from ros2_memory.analysis.conditions import Condition, Equals, NearPosition, matched_texts
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -443,18 +443,21 @@ def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage 
     return next(islice(filter(search.matches, at_once), run.later, None), None)
 
 
-def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
+def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) -> Ns:
     """Returns until when (ns) a state lasted: until a message says otherwise, or the window ends.
 
     A state lasts until its last match if a silence follows, and so does a log entry. A state of a
-    latched topic lasts through silences. No state lasts beyond the scope.
+    latched topic, and a flag of a rare one, lasts through silences. No state lasts beyond the
+    scope.
     """
     last = run.last
     if view.timeline.is_log(run.topic):
         return last
     _, end = scope.window.asked()
-    if run.until == MAX_NS or is_latched(view, run.topic):
-        return scope.holds_until(last, held_until(view, run.topic, last, end))
+    may_hold = is_latched(view, run.topic) or (is_flag and holds_on(view, [run.topic]))
+    if run.until == MAX_NS or may_hold:
+        until = held_until(view, run.topic, last, end, or_rare=is_flag)
+        return scope.holds_until(last, until)
     is_silent = run.until - last > SILENCE_NS
     return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
 
@@ -489,7 +492,9 @@ def _sighting(
         topic=run.topic,
         first=run.first,
         last=run.last,
-        until=_lasted_until(view, run, scope) if thing is None else run.last,
+        until=run.last
+        if thing is not None
+        else _lasted_until(view, run, scope, is_flag=_is_flag(condition)),
         messages=run.messages,
         begun=run.begun > 0,
         robot=robot,
@@ -503,6 +508,13 @@ def _sighting(
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
     )
+
+
+def _is_flag(condition: Condition) -> bool:
+    """Returns whether a condition asks for true or false, which holds until a message toggles."""
+    if not isinstance(condition.test, Equals):
+        return False
+    return str(condition.test.value).casefold() in ("true", "false")
 
 
 def _counted_content(

@@ -186,6 +186,19 @@ def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after
     assert (whole["count"], whole["seconds"]) == (began, held)
 
 
+@each_way
+def test_a_boolean_of_a_rare_topic_lasts_until_it_toggles_back(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As of a dock; nothing is recorded from 7999 s on. It lasts as long as with `by`."""
+    changes = ((100, False), (4000, True), (5000, False), (6000, True))
+    messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
+    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(8000)]
+    write_splits(tmp_path, messages, 2000)
+    found = matches(tmp_path, BUMPER, 0, 10_000, recalls=recalls)["sightings"]
+    assert [row["duration_s"] for row in found] == [1999.0, 1000.0]
+
+
 TRUE = 1_784_030_400
 UNSET = 86_400
 AHEAD = 2_082_758_400
