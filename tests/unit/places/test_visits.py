@@ -94,7 +94,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
     assert ("odometry restarted" in str(answer.notes)) is not in_map
     assert visits(with_store(memory, tmp_path), Call(), 0.0, 0.0, radius_m=1.0) == answer
     driven = asked(memory, "trajectory_summary", start=T0, end=T0 + 1100)
-    assert "odometry restarted" in str(driven["notes"])
+    assert "jumped back to their origin 1 time, as where odometry restarts" in str(driven["notes"])
     assert "of the jumps" not in str(driven["notes"])
 
 

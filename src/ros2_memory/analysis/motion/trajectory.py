@@ -392,8 +392,8 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         )
     if totals.resets:
         yield (
-            f"odometry restarted {counted(len(totals.resets), 'time')}: "
-            "the jumps back to its origin are left out of distance and speed"
+            f"positions jumped back to their origin {counted(len(totals.resets), 'time')}, as "
+            "where odometry restarts: left out of distance and speed"
         )
 
 
