@@ -141,13 +141,14 @@ def recap(
     min_score: float | None = None,
     most_events: int = MOST_EVENTS,
     with_changes: bool = True,
+    with_sights: bool = True,
 ) -> Recap:
     """Returns what happened in a window; with `where` only while the robot was in that region.
 
     Places are in the map if transforms lead there at their time, or in `frame_id`. Things in view
     count with a best score of `min_score` or more, or without scores. If there are more than
     `most_events`, the most important ones are returned. With `with_changes` they have what changed
-    before them.
+    before them. Without `with_sights` things in view are no events, but counted all the same.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
@@ -180,7 +181,11 @@ def recap(
     note_edges(view, window)
     note_foxglove_logs(view, window)
     counts = happened.counts
-    shown = _most_important(view, happened.events, counts, most_events)
+    kinds = [kind for kind in counts if with_sights or kind != "thing"]
+    events = [event for event in happened.events if event.kind in kinds]
+    shown = _most_important(
+        view, events, Counter({kind: counts[kind] for kind in kinds}), most_events
+    )
     if with_changes:
         shown = _with_changes(changes_in(view, window, topics), shown)
     shown = [

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
+from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.motion.robot_track import cut_track, track_of
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -39,7 +40,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import detections, odom, write_mcap, write_splits
+from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
 from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.analysis.motion.posed import off_line
@@ -392,6 +393,32 @@ def test_what_was_seen_has_each_label_once_however_often_another_one_was(tmp_pat
     found = received(moment_reply(query, memory, Call()))
     rows = [(row["label"], row["t"] - BEGIN_S, row["end"] - BEGIN_S) for row in found["seen"]]
     assert rows == [("person", 0, 14), ("cup", 1826, 1827)]
+
+
+def test_sightings_take_no_place_of_what_happened_in_a_stretch(tmp_path: Path) -> None:
+    """A person comes into view 40 times, and a bumper toggles 59 times: both on any day."""
+    seen = ["person" if n % 45 < 15 else "" for n in range(40 * 45)]
+    messages = [detections(BEGIN + n * S, [label] * bool(label)) for n, label in enumerate(seen)]
+    messages += [boolean(BEGIN + n * S, n // 30 % 2 == 1) for n in range(40 * 45)]
+    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    query = QueryParams(f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
+    found = received(moment_reply(query, memory, Call()))
+    assert {row["kind"] for row in found["events"]} == {"flip"}
+    assert len(found["events"]) == 59
+    assert not [note for note in found["notes"] if "too many" in note]
+
+
+def test_a_note_says_where_labels_were_in_view_too_often_to_list_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topic_events, "MAX_INTERVALS", 10)
+    messages = [detections(BEGIN + n * S, ["cup"] * (n % 10 < 2)) for n in range(300)]
+    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    window = TimeWindow(BEGIN, BEGIN + 300 * S)
+    found = received(labels_shown(memory, Call(), window))
+    assert found["labels"][0]["sightings"] == 10
+    [note] = found["notes"]
+    assert note.endswith("changes too often to list each change: 20 more")
 
 
 def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(

@@ -184,11 +184,11 @@ async function lookAtTopics() {
 async function lookAtLabels() {
   const { recording, span } = state;
   try {
-    const { labels, labels_total, end } = await asked("/page/labels", { ...chosenPart(),
+    const { labels, labels_total, end, notes } = await asked("/page/labels", { ...chosenPart(),
       start: span.start.toFixed(3), end: span.end.toFixed(3) }, onlyLast("labels"));
     const { view } = state;
     if (recording !== state.recording || span.start !== state.span.start) return;
-    view.seen = { labels, total: labels_total, until: Math.min(end, view.range.latest) };
+    view.seen = { labels, total: labels_total, notes, until: Math.min(end, view.range.latest) };
     line.show(view, state.span);
     showEvents(at("events"), view, chooseStretch, chooseLabel);
   } catch (error) {

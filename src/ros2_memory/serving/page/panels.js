@@ -117,12 +117,13 @@ function sightingRows(view, point, choose) {
   const rows = [...all, ...eventRows(some, point)];
   const isWhole = (counts.sightings || 0) <= some.length;
   if (isWhole && !rows.length) return [];
-  const { labels, total } = view.seen || { labels: [], total: 0 };
+  const { labels, total, notes } = view.seen || { labels: [], total: 0 };
   const byLabel = labels.map((each) => pair(link(each.label, () => choose(each.label)),
     `${counted(each.sightings, "sighting")}, ${lasting(each.seconds)}`));
   const left = total - labels.length;
   return [el("h3", {}, "Sightings"), ...listing(isWhole ? rows : byLabel, 6),
-    ...(isWhole || left <= 0 ? [] : [soft(`${counted(left, "more label")} not listed.`)])];
+    ...(isWhole || left <= 0 ? [] : [soft(`${counted(left, "more label")} not listed.`)]),
+    ...notesOf(notes)];
 }
 function showEvents(host, view, point, choose) {
   const shown = view.events.filter((each) => each.kind !== "thing").reverse();

@@ -487,6 +487,7 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
         TimeRange(at_s - AROUND_S, at_s + AROUND_S),
         most_events=MOST_SEEN,
         with_changes=False,
+        with_sights=False,
     )
     changes = [*preceding.changes, *preceding.after]
     return {
@@ -506,15 +507,19 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
         QueryTimeoutError: the call's time is over.
     """
     summary = recap(
-        memory, call, TimeRange(start_s, end_s), most_events=MOST_SEEN, with_changes=False
+        memory,
+        call,
+        TimeRange(start_s, end_s),
+        most_events=MOST_SEEN,
+        with_changes=False,
+        with_sights=False,
     )
-    others = [event for event in summary.events if event.kind != "thing"]
     return {
         "start": start_s,
         "end": end_s,
         **SUMMARY.render(summary),
         "seen": _seen(summary),
-        "events": [EVENT.render(event) for event in others],
+        "events": [EVENT.render(event) for event in summary.events],
         "notes": [*summary.notes],
     }
 

@@ -36,6 +36,7 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.fields import fields_of
 from ros2_memory.insights.recap import events_by_topic
 from ros2_memory.insights.status import usual_rate
+from ros2_memory.insights.topic_events import note_left_out
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -53,12 +54,17 @@ _PATIENT_S: Final = 8.0
 def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     """Returns the labels that were in view longest: how often, for how many seconds, and when.
 
+    Notes say of which topics sightings are left out, since they have too many.
+
     Raises:
         QueryTimeoutError: the call's time is over.
     """
     view = View(memory, call.within(_PATIENT_S), window.stop)
     least = memory.limits.min_score
-    in_view = [events.visible for events in events_by_topic(view, window).values()]
+    topics = events_by_topic(view, window)
+    for topic, events in topics.items():
+        note_left_out(view, topic, events)
+    in_view = [events.visible for events in topics.values()]
     if least:
         in_view = [visible.scoring(least) for visible in in_view]
     rows = [
@@ -68,7 +74,12 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     ]
     rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))
     shown: list[JsonValue] = [*rows[:MOST_LABELS]]
-    return {"end": unix_from_ns(window.stop), "labels": shown, "labels_total": len(rows)}
+    return {
+        "end": unix_from_ns(window.stop),
+        "labels": shown,
+        "labels_total": len(rows),
+        "notes": [*view.notes.sentences()],
+    }
 
 
 def _label_row(label: str, first: Ints, last: Ints, window: TimeWindow) -> JsonObject:
