@@ -13,7 +13,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
@@ -24,7 +24,7 @@ from ros2_memory.messages.conversions import (
     names_beside,
     names_others,
 )
-from ros2_memory.messages.detections import detections_of, without_low_scores
+from ros2_memory.messages.detections import detections_of, parsed_json, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -392,7 +392,7 @@ def at_field(value: T, dot_path: str) -> list[T]:
     In a list the path goes on in every element: `detections.label` gives all labels. A whole number
     picks one element (negative: from the end): `detections.0.label` gives the first label. A number
     picks an axis of a point, too. `positions.elbow` of joint states gives the position beside
-    `elbow` in the list of names.
+    `elbow` in the list of names. In a text that is JSON the path goes on, too.
     """
     head, _, name = dot_path.partition(".")
     names = names_beside(value, dot_path)
@@ -524,6 +524,8 @@ def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> 
         else:
             for element in node:
                 yield from _descend(element, segment, pick)
+    elif isinstance(node, str) and looks_like_json(node):
+        yield from _descend(cast("T", parsed_json(node)), segment, pick)
 
 
 def leaves(value: T, *, in_objects: bool = True) -> Iterator[T]:

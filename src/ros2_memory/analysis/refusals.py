@@ -21,7 +21,9 @@ from ros2_memory.analysis.conditions import (
     plain_text,
     positions,
 )
+from ros2_memory.core.text import listed, looks_like_json
 from ros2_memory.messages.conversions import NamedNumber, Summary, names_beside
+from ros2_memory.messages.detections import parsed_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -51,14 +53,30 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
 
 
 def _hint_on_json(value: JsonValue) -> str:
-    """Returns how to ask about a text that is JSON, of which no field can be named."""
+    """Returns the fields of the JSON that is all of a value, and how to search it as a text."""
     text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
-    if not isinstance(text, str) or not text.lstrip().startswith(("{", "[")):
+    if not isinstance(text, str) or not looks_like_json(text):
         return ""
     return (
-        ", a text of JSON: contains and contains_word look for words in it, and min_score leaves "
-        "out detections"
+        f", a text of JSON, with {_fields_of_json(text)}: contains and contains_word look for "
+        "words in it, and min_score leaves out detections"
     )
+
+
+def _fields_of_json(text: str) -> str:
+    paths = dict.fromkeys(_dot_paths(parsed_json(text), "value."))
+    return listed([*paths], at_most=_LISTED_PATHS) or "no fields"
+
+
+def lack_in_json(field: str, value: JsonValue) -> str | None:
+    """Returns that the JSON which is all of a value lacks a field, and its fields; else None.
+
+    Other messages may have the field, so that this is no refusal.
+    """
+    text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
+    if not field.startswith("value.") or not isinstance(text, str) or at_field(value, field):
+        return None
+    return f"its newest JSON has no {field}, but {_fields_of_json(text)}"
 
 
 def _refusal_for_position(value: JsonValue) -> str | None:
@@ -165,9 +183,13 @@ def _is_array(value: JsonValue) -> bool:
 
 
 def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
-    """Returns whether the path leads through an empty list or a null."""
+    """Returns whether the path leads through an empty list, a null, or JSON, which may differ."""
     nodes = chain.from_iterable(along(value, dot_path.split("."))[:-1])
-    return any(node is None or node == [] for node in nodes)
+    return any(node is None or node == [] or _is_json(node) for node in nodes)
+
+
+def _is_json(value: JsonValue) -> bool:
+    return isinstance(value, str) and looks_like_json(value)
 
 
 def _has_unknown_part(value: JsonValue) -> bool:

@@ -43,6 +43,7 @@ from ros2_memory.core.text import dotted
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import (
     ANGLES,
+    INDEX,
     SUMMARIZED,
     Summary,
     ValueKind,
@@ -55,7 +56,7 @@ from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.stored import Topic
     from ros2_memory.core.arrays import Floats
@@ -410,6 +411,24 @@ def at_field(root: Node, dot_path: str) -> list[Node]:
     if any(UNKNOWN in nodes for nodes in by_segment):
         raise UnknownShapeError(f"{dot_path} leads to a part that is not known")
     return by_segment[-1]
+
+
+def texts_above(root: Node, dot_path: str) -> Iterator[tuple[Leaf, str]]:
+    """Yields the texts on a dot-path, which may be JSON, each with the rest of the path."""
+    path = dot_path.split(".")
+    for nth, nodes in enumerate(conditions.along(root, path, element_at)[1:-1], 1):
+        # A number picks an element of a list, which is the next node.
+        is_pick = INDEX.fullmatch(path[nth]) is not None
+        for node in nodes:
+            for leaf in () if is_pick and isinstance(node, list) else _leaves_outside(node):
+                if leaf.kind is Kind.TEXT:
+                    yield leaf, ".".join(path[nth:])
+
+
+def _leaves_outside(node: Node) -> Iterator[Leaf]:
+    """Yields a leaf, or those of a list."""
+    leaves = conditions.leaves(node, in_objects=False)
+    return (leaf for leaf in leaves if isinstance(leaf, Leaf))
 
 
 def _named_elements(array: list[Node], names: Leaf, name: str) -> list[Node]:

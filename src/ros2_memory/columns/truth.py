@@ -24,7 +24,16 @@ from ros2_memory.analysis.conditions import (
     points,
 )
 from ros2_memory.columns.detections import may_be_json, without_low
-from ros2_memory.columns.shown import NOTHING, ByType, Listing, Node, Shape, at_field, leaves_of
+from ros2_memory.columns.shown import (
+    NOTHING,
+    ByType,
+    Listing,
+    Node,
+    Shape,
+    at_field,
+    leaves_of,
+    texts_above,
+)
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import as_float
 from ros2_memory.columns.values import (
@@ -44,7 +53,7 @@ from ros2_memory.columns.values import (
 )
 from ros2_memory.core.text import looks_like_json
 from ros2_memory.messages.conversions import names_beside
-from ros2_memory.messages.detections import without_low_scores
+from ros2_memory.messages.detections import parsed_json, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -61,7 +70,7 @@ _ROUNDING: Final = 1e-9
 _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 
-_Test: TypeAlias = "_LeafTest | _PlaceTest"
+_Test: TypeAlias = "_LeafTest | _JsonTest | _PlaceTest"
 
 
 class ColumnCondition:
@@ -91,7 +100,7 @@ class ColumnCondition:
         if plan.counted is None or not tests:
             return _any_of(tests, values)
         counted = _any_of(_possible(plan.counted, values), values)
-        leaves = [test.leaf for test in plan.counted if isinstance(test, _LeafTest)]
+        leaves = [test.leaf for test in plan.counted if not isinstance(test, _PlaceTest)]
         if not may_be_json(values, [leaf for leaf in leaves if leaf.json_depth]):
             return counted
         # A text in which detections were left out is another text: both have to pass.
@@ -223,6 +232,8 @@ def _tests(condition: Condition, value: Node) -> list[_Test]:
     test, field = condition.test, condition.field
     targets = [value] if field is None else at_field(value, field)
     tests: list[_Test] = []
+    for text, rest in () if field is None else texts_above(value, field):
+        tests.append(_JsonTest(Condition(test, rest), text, condition.least_score))
     for target in targets:
         leaves = leaves_of(target)
         if isinstance(test, NearPosition):
@@ -235,6 +246,35 @@ def _tests(condition: Condition, value: Node) -> list[_Test]:
             if leaf_test.is_needed:
                 tests.append(leaf_test)
     return tests
+
+
+class _JsonTest(NamedTuple):
+    """A condition on the JSON in a text; of its detections only those with `least_score` count."""
+
+    condition: Condition
+    leaf: Leaf
+    least_score: float
+
+    def may_match(self, zones_of: ZonesOf[Leaf]) -> bool | Mask:
+        """Returns which parts may have a text that passes; True if all may."""
+        zones = zones_of(self.leaf)
+        return True if zones is None else zones.may_be_json
+
+    def passing(self, values: Values) -> Iterator[_Passing]:
+        """Yields which rows or elements pass.
+
+        Raises:
+            UnknownShapeError: the table cannot say.
+        """
+        truth = TruthValues.known(values.texts(self.leaf).are(self._passes_text))
+        yield _Passing(self.leaf.level, truth, self.leaf.limits)
+
+    def _passes_text(self, word: str) -> bool:
+        if not looks_like_json(word):
+            return False
+        depth = self.leaf.json_depth
+        text = str(without_low_scores(word, self.least_score, depth)) if depth else word
+        return self.condition.matches(parsed_json(text))
 
 
 class _LeafTest(NamedTuple):

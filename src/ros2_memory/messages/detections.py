@@ -163,7 +163,7 @@ class _Walk:
             ]
             return value if all(map(is_, elements, value)) else elements
         if isinstance(value, str) and looks_like_json(value):
-            parsed = _parse_json(value)
+            parsed = parsed_json(value)
             inside = inside if inside is _Inside.BESIDE else _Inside.JSON
             remaining = self.visit(parsed, frame, depth - 1, inside)
             return value if remaining is parsed else json.dumps(remaining, ensure_ascii=False)
@@ -328,7 +328,7 @@ def _detection_at(
     return Detection(label, None, frame, score)
 
 
-def _parse_json(text: str) -> JsonValue:
+def parsed_json(text: str) -> JsonValue:
     """Parses a string that is JSON; None for one that is not, or is too long."""
     if len(text) > _MAX_JSON_CHARS:
         return None

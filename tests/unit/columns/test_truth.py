@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import Condition
+from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals
 from ros2_memory.analysis.facts import LABEL, Facts, State, Word, state_of, stated_by
 from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
 from ros2_memory.columns.poses import NoPoseError, PoseColumns
@@ -26,6 +26,7 @@ from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES
 from ros2_memory.messages.detections import Detection, detections_of
+from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import (
@@ -78,6 +79,45 @@ def judged(
 
 def values_of(drawn: Drawn, extractor: SchemaExtractor = EXTRACTOR) -> list[JsonValue]:
     return [extractor.exact(message, drawn.type) for message in drawn.messages]
+
+
+SAID = st.sampled_from(
+    [
+        '{"a": 1, "b": {"a": "x"}}',
+        '[{"a": 2}, {"a": true}]',
+        '"{\\"a\\": 1}"',
+        "x",
+        "",
+        "[",
+        '{"a": [3]}',
+    ]
+)
+PATHS = st.sampled_from(["a", "b.a", "b", "0.a", "1.a", "a.0"])
+TESTS = st.sampled_from(
+    [Equals(1), Equals("x"), Equals(True), Beyond(1, above=True), Contains("x")]
+)
+
+
+@given(st.lists(st.lists(SAID, max_size=3), min_size=1, max_size=4), PATHS, TESTS)
+def test_truth_of_a_field_in_json_is_that_of_each_message(
+    said: list[list[str]], path: str, test: Equals | Beyond | Contains
+) -> None:
+    kind, status = "diagnostic_msgs/msg/KeyValue", "diagnostic_msgs/msg/DiagnosticStatus"
+    messages = [
+        make(
+            status,
+            level=0,
+            name="",
+            message=texts[0] if texts else "",
+            hardware_id="",
+            values=[make(kind, key="", value=each) for each in texts],
+        )
+        for texts in said
+    ]
+    drawn = drawn_of(status, messages)
+    values = values_of(drawn)
+    for field in (f"message.{path}", f"values.value.{path}", f"values.0.value.{path}"):
+        assert not judged(drawn.table, Condition(test, field), values)
 
 
 @settings(max_examples=examples(150))

@@ -198,8 +198,9 @@ def test_a_field_of_json_is_refused_with_what_to_ask_instead(tmp_path: Path) -> 
     given = {"condition_type": "above", "field": "detections.confidence", "value": 0.8}
     refused = asked(memory, "find_matches", topic="/plants", **given)["detail"]
     assert refused.endswith(
-        "their fields are: value, a text of JSON: contains and contains_word look for words in it, "
-        "and min_score leaves out detections"
+        "their fields are: value, a text of JSON, with value.detections, value.detections.class, "
+        "value.detections.confidence, value.detections.bbox: contains and contains_word look for "
+        "words in it, and min_score leaves out detections"
     )
     assert asked(memory, "find_matches", topic="/said", **given)["detail"].endswith("are: value")
 

@@ -99,6 +99,39 @@ def test_each_text_that_an_autopilot_reports_is_one_sighting(tmp_path: Path, rec
     assert [sighting["duration_s"] for sighting in reply["sightings"]] == [0.0, 0.0]
 
 
+@each_way
+def test_fields_of_json_in_a_text_are_conditions_like_others(tmp_path: Path, recalls: bool) -> None:
+    """A state machine says its state, and a battery, in a std_msgs/String."""
+    states = ['{"state": "docked"}', '{"state": "driving", "battery": {"pct": 40}}', "no JSON"]
+    said = [text(BEGIN + at * S, states[at // 10], topic="/state") for at in range(30)]
+    counted = [boolean(BEGIN + at * S, at % 5 == 0, topic="/bumper") for at in range(30)]
+    memory = remembered(tmp_path, [*said, *counted, odom(BEGIN)], recalls=recalls)
+    driving = {"topic": "/state", "condition_type": "equals", "field": "data.state"}
+    driving["value"] = "driving"
+    [found] = asked(memory, "find_matches", **driving)["sightings"]
+    assert (found["first_seen"] - T0, found["duration_s"]) == (10, 10.0)
+    low = {**driving, "condition_type": "below", "field": "data.battery.pct", "value": 50}
+    assert asked(memory, "find_matches", **low)["sightings"][0]["count"] == 10
+    bumps = {"topic": "/bumper", "condition_type": "equals", "value": True, "while": [driving]}
+    assert asked(memory, "find_matches", **bumps)["total"] == 2
+    rows = asked(memory, "find_matches", **low, by="hour")
+    assert dict(zip(rows["columns"][1:], rows["all"], strict=True))["seconds"] == 10.0
+
+
+@each_way
+def test_a_field_that_the_newest_json_lacks_is_searched_and_named(
+    tmp_path: Path, recalls: bool
+) -> None:
+    said = [text(BEGIN + at * S, f'{{"state": "idle", "n": {at}}}', "/state") for at in range(9)]
+    said.insert(4, text(BEGIN + 3 * S + 1, '{"fall": {"at": "stairs"}}', "/state"))
+    memory = remembered(tmp_path, [*said, odom(BEGIN)], recalls=recalls)
+    ask = partial(asked, memory, "find_matches", topic="/state", condition_type="contains")
+    assert ask(field="data.fall.at", value="stairs")["total"] == 1
+    never = ask(field="data.stat", value="idle")
+    assert never["total"] == 0
+    assert "/state: its newest JSON has no value.stat, but value.state, value.n" in never["notes"]
+
+
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
     moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
     memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
