@@ -147,6 +147,11 @@ class Msg:
         return bytes(typestore().serialize_cdr(self.body, self.type))
 
 
+def in_order(messages: Iterable[Msg]) -> list[Msg]:
+    """The messages in the order in which a recorder writes them."""
+    return sorted(messages, key=lambda message: message.log_time)
+
+
 @dataclass(frozen=True)
 class McapLayout:
     """The legal layouts of an MCAP file that differ for a reader."""
@@ -244,7 +249,7 @@ def write_splits(
 def splits_of(messages: Iterable[Msg], split_s: float) -> dict[int, list[Msg]]:
     """The messages of each split, in order, numbered from 1,784,000,000 s on."""
     splits: dict[int, list[Msg]] = {}
-    for each in sorted(messages, key=lambda each: each.log_time):
+    for each in in_order(messages):
         number = int((each.log_time / 1e9 - 1_784_000_000) // split_s)
         splits.setdefault(number, []).append(each)
     return splits
@@ -363,6 +368,11 @@ def odom(
         ),
     )
     return Msg(topic, "nav_msgs/msg/Odometry", ns if log_time is None else log_time, body, ns)
+
+
+def along_x(begin: int, seconds: float, *, mps: float = 0.0, hz: int = 1) -> list[Msg]:
+    """The odometry of a robot that drives along x from 0 at a speed (m/s); 0 where it stands."""
+    return [odom(begin + n * 10**9 // hz, n / hz * mps) for n in range(round(seconds * hz))]
 
 
 def transform(

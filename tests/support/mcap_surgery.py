@@ -9,7 +9,8 @@ from typing import Any
 
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
+from mcap.records import Chunk, ChunkIndex
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from tests.support.bags import McapLayout, Msg, text
@@ -41,6 +42,16 @@ def chunks_of(path: Path) -> list[ChunkIndex]:
         summary = make_reader(stream).get_summary()
         assert summary is not None
         return summary.chunk_indexes
+
+
+def unpacked(path: Path) -> list[bytes]:
+    """The bytes of a file, and the data of each record in its chunks."""
+    parts = [path.read_bytes()]
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                parts += [getattr(each, "data", b"") for each in breakup_chunk(record)]
+    return parts
 
 
 def spoil_chunk(path: Path, number: int) -> None:
