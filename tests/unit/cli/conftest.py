@@ -16,6 +16,20 @@ from tests.support.program import Printed, Program, exits
 __all__ = ["exits"]
 
 Forget = Callable[..., Printed]
+Using = Callable[..., None]
+
+
+@pytest.fixture
+def using(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Using:
+    """Has commands use a bag directory, and keep what they cache beside it."""
+
+    def use(bag_dir: Path, deployment: str = "") -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        if deployment:
+            monkeypatch.setenv("MEMORY_DEPLOYMENT", deployment)
+
+    return use
 
 
 @pytest.fixture

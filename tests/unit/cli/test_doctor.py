@@ -19,10 +19,10 @@ from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
-from tests.support.bags import McapLayout, Msg, odom, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, along_x, in_order, odom, tf, transform, write_mcap
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.program import Program
-from tests.unit.cli.conftest import left
+from tests.unit.cli.conftest import Using, left
 
 Examined = Callable[..., dict[str, list[dict[str, str]]]]
 
@@ -56,7 +56,7 @@ def port() -> Iterator[int]:
 
 
 @pytest.fixture
-def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, using: Using, port: int) -> Path:
     """A bag directory of a robot with which all is well, and the settings that lead there."""
     bag_dir = tmp_path / "bags"
     now = time.time_ns()
@@ -66,8 +66,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
     stub_ros2.install(tmp_path / "bin" / "ros2")
     (tmp_path / "topics.yaml").write_text("topics: [/odom]\n")
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    using(bag_dir, "robot")
     monkeypatch.setenv("MCP_PORT", str(port))
     overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.1"]
     monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", " ".join([*overrides, "retention.min_free_gb=0"]))
@@ -116,7 +115,7 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
 def test_a_simulation_that_was_reset_needs_no_other_clock(
     tmp_path: Path, examined: Examined
 ) -> None:
-    run = [odom(n * NS_PER_S, n / 10, 0.0) for n in range(60)]
+    run = along_x(0, 60, mps=0.1)
     write_mcap(tmp_path / "run" / "run_0.mcap", [*run, *run[:40]])
     [clock] = examined(1, str(tmp_path))["clock"]
     assert clock["do"] == "record each run of a simulation in a recording of its own"
@@ -345,7 +344,7 @@ def test_poses_that_are_to_be_chosen_and_a_map_of_another_name_are_told(
         for message in placed
     ]
     others = [replace(message, topic="/fused") for message in placed]
-    write_mcap(bag, sorted([*placed, *others, *site], key=lambda message: message.log_time))
+    write_mcap(bag, in_order([*placed, *others, *site]))
     beat(robot, subscribed=("/odometry",))
     [unknown] = examined(1)["poses"]
     assert unknown["do"].startswith("data.pose_topic is /odom, which these bags do not have; ")

@@ -1,7 +1,6 @@
 """`ros2-memory export`: what comes out is what was recorded, and other programs read it."""
 
 import shutil
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from datetime import datetime
@@ -27,6 +26,7 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     odom,
     text,
     tf,
@@ -38,7 +38,7 @@ from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import memory_of
 from tests.support.program import Program
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
-from tests.unit.cli.conftest import left
+from tests.unit.cli.conftest import Using, left
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()
@@ -59,13 +59,12 @@ def driven(start: int, number: int) -> list[Msg]:
 
 
 @pytest.fixture
-def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def bag_dir(tmp_path: Path, using: Using) -> Path:
     """Two recordings, the second on another day (UTC)."""
     folder = tmp_path / "bags"
     for number, start in enumerate((T0, T0 + 86_400 * NS_PER_S)):
         write_mcap(folder / f"rec_{number}" / f"rec_{number}_0.mcap", driven(start, number))
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
+    using(folder, "replay")
     return folder
 
 
@@ -109,7 +108,7 @@ def test_of_a_time_that_a_file_has_twice_each_command_says_that_both_are_mixed(
     tmp_path: Path, exits: Program
 ) -> None:
     """As of a simulation that was reset while its clock gave the log times."""
-    poses = [odom(T0 + n * NS_PER_S, n / 2) for n in range(60)]
+    poses = along_x(T0, 60, mps=0.5)
     write_mcap(tmp_path / "bags" / "run" / "run_0.mcap", [*poses, *poses[:40]])
     bags = tmp_path / "bags"
     for command in (
@@ -247,14 +246,6 @@ def test_what_cannot_be_decoded_has_a_row_that_says_why(tmp_path: Path, exits: P
     ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
     assert reason
     assert value is None
-
-
-def test_without_the_optional_part_it_says_how_to_get_it(
-    bag_dir: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert "pip install '.[parquet]'" in exits(2, f"export --parquet {tmp_path}/rows").err
 
 
 def queried(folder: Path, query: str) -> list[tuple[object, ...]]:

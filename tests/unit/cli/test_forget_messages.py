@@ -18,8 +18,6 @@ from typing import Any
 
 import pytest
 from mcap.reader import NonSeekingReader
-from mcap.records import Chunk
-from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import Reader
 
@@ -44,8 +42,9 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import described, made_moment, own_all
+from tests.support.mcap_surgery import unpacked
 from tests.support.program import Program
-from tests.unit.cli.conftest import Forget, columns_in, left, locked
+from tests.unit.cli.conftest import Forget, Using, columns_in, left, locked
 
 S = NS_PER_S
 T0 = 1_700_000_000 * S
@@ -87,11 +86,9 @@ def recorded(bag_dir: Path, layout: McapLayout | None = None) -> list[Path]:
 
 
 @pytest.fixture
-def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def bag_dir(tmp_path: Path, using: Using) -> Path:
     bag_dir = tmp_path / "bags"
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    using(bag_dir, "robot")
     recorded(bag_dir)
     own_all(bag_dir)
     return bag_dir
@@ -130,13 +127,8 @@ def traces(root: Path, needle: str) -> list[str]:
     """Where a text is below a directory: in bytes of files, in chunks, in what is packed."""
     found: list[str] = []
     for path in (each for each in root.rglob("*") if each.is_file()):
-        parts = [path.read_bytes()]
-        if path.suffix in {".mcap", ".repair"} and parts[0].startswith(b"\x89MCAP"):
-            with path.open("rb") as stream:
-                for record in StreamReader(stream, emit_chunks=True).records:
-                    if isinstance(record, Chunk):
-                        inner = breakup_chunk(record)
-                        parts += [getattr(each, "data", b"") for each in inner]
+        is_bag = path.suffix in {".mcap", ".repair"} and path.read_bytes().startswith(b"\x89MCAP")
+        parts = unpacked(path) if is_bag else [path.read_bytes()]
         if path.name == FILE:
             parts += columns_in(path)
         if any(needle.encode() in part for part in parts):
@@ -346,27 +338,38 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path, forget: Forget, statement: 
     assert f"{SAID} 0 3".encode() in path.read_bytes()
 
 
+HOME_BAG = "home/rec_h/rec_h_0.mcap"
+ForgetBathroom = Callable[[int, Iterable[Msg]], str]
+
+
+@pytest.fixture
+def forget_bathroom(tmp_path: Path, using: Using, forget: Forget, exits: Program) -> ForgetBathroom:
+    """Forgets the time in the bathroom, 3 m to 5 m along X, in a robot's bag of these messages."""
+
+    def run(code: int, body: Iterable[Msg]) -> str:
+        left(write_mcap(tmp_path / HOME_BAG, body))
+        own_all(tmp_path / "home")
+        places = tmp_path / "places.yaml"
+        places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
+        using(tmp_path / "home", "robot")
+        exits(0, "index")
+        return forget(code, 0, 100, f"--yes --where bathroom data.places_file={places}").out
+
+    return run
+
+
 def test_the_time_in_a_place_goes_with_a_second_on_either_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget, exits: Program
+    tmp_path: Path, forget_bathroom: ForgetBathroom
 ) -> None:
-    """The robot drives along X at 1 m/s; the bathroom is from 3 m to 5 m."""
-    home, places = tmp_path / "home", tmp_path / "places.yaml"
+    """The robot drives at 1 m/s."""
     mount = transform(T0, "base_link", "laser", (0.1, 0.0, 0.2))
     found = [tf(T0, mount, topic="/tf_static")]
     for n in range(100):
         at = T0 + n * S // 10
         found += [odom(at, n / 10, 0.0), text(at + 7, f"{SAID} {n:02}", CAMERA)]
-    bag = left(write_mcap(home / "rec_h" / "rec_h_0.mcap", found))
-    own_all(home)
-    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    exits(0, "index")
-    shown = forget(0, 0, 100, f"--yes --where bathroom data.places_file={places}").out
-    assert "latched messages stay" in shown
+    assert "latched messages stay" in forget_bathroom(0, found)
     times: dict[str, set[int]] = {}
-    for each in whole(bag):
+    for each in whole(tmp_path / HOME_BAG):
         times.setdefault(str(each[3]), set()).add((int(str(each[7])) - T0) // 10**8)
     outside = {n for n in range(100) if not 20 <= n <= 60}
     # The track knows to a few centimetres where the robot was, and the robot drives 1 m/s.
@@ -374,45 +377,28 @@ def test_the_time_in_a_place_goes_with_a_second_on_either_side(
         assert times[topic] <= outside | {20, 21, 59, 60}
         assert times[topic] >= outside - {19, 61}
     assert times["/tf_static"] == {0}
-    assert traces(home, f"{SAID} 40") == []
-    assert traces(home, f"{SAID} 70")
-
-
-def home_with_a_bathroom(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, body: Iterable[Msg]
-) -> Path:
-    """A robot's own bag with these messages, which commands use; returns the file of places."""
-    home, places = tmp_path / "home", tmp_path / "places.yaml"
-    left(write_mcap(home / "rec_h" / "rec_h_0.mcap", body))
-    own_all(home)
-    places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return places
+    assert traces(tmp_path, f"{SAID} 40") == []
+    assert traces(tmp_path, f"{SAID} 70")
 
 
 def test_of_a_place_what_was_recorded_while_nobody_knew_where_the_robot_was_is_said_to_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+    forget_bathroom: ForgetBathroom,
 ) -> None:
     """The odometry is silent for 40 s, the camera is not."""
     body = [odom(T0 + n * S, n, 0.0) for n in range(60) if not 10 < n < 50]
     body += [text(T0 + n * S + 7, f"{SAID} {n:02}", CAMERA) for n in range(60)]
-    places = home_with_a_bathroom(tmp_path, monkeypatch, body)
-    shown = forget(1, 0, 100, f"--yes --where bathroom data.places_file={places}").out
     unknown = f"from {T0 // S + 10}.000001 to {T0 // S + 50}.000000 (40 s)"
-    assert f"what is not known: where the robot was is not known {unknown}" in shown
+    said = f"what is not known: where the robot was is not known {unknown}"
+    assert said in forget_bathroom(1, body)
 
 
 def test_of_a_place_nothing_stays_because_the_clock_was_set_ahead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
+    forget_bathroom: ForgetBathroom,
 ) -> None:
     """The robot drives on while the clock skips 8 s, of which nothing can have been recorded."""
     body = [odom(T0 + n * S // 10 + 8 * S * (n >= 305), n / 20, 0.0) for n in range(600)]
     body += [text(T0 + n * S + 8 * S * (n > 30) + 7, SAID, CAMERA) for n in range(60)]
-    places = home_with_a_bathroom(tmp_path, monkeypatch, body)
-    shown = forget(0, 0, 100, f"--yes --where bathroom data.places_file={places}").out
-    assert "what is not known" not in shown
+    assert "what is not known" not in forget_bathroom(0, body)
 
 
 def test_whatever_was_done_before_the_power_went_the_next_forget_finishes_it_and_says_so(

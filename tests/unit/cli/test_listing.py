@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from ros2_memory import cli
+from ros2_memory import bootstrap, cli
 from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
 from ros2_memory.cli import output
 from ros2_memory.cli.app import COMMANDS, epilog
@@ -34,6 +34,7 @@ from tests.support.bags import Msg, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
+from tests.unit.cli.conftest import Using
 
 T0 = 1_700_000_000 * NS_PER_S
 
@@ -112,6 +113,23 @@ def test_what_makes_no_sense_is_refused_with_the_reason(
     assert "\x1b" not in refused
 
 
+@pytest.mark.parametrize(
+    ("line", "extra"),
+    [
+        ("export a --parquet rows", "parquet"),
+        ("plot path a --out a.svg", "plot"),
+        ("ship --once deployment=lake 'fleet.robots={a: a}' lake.warehouse=lake", "lake"),
+    ],
+)
+def test_a_command_whose_extra_is_not_installed_names_it(
+    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, line: str, extra: str
+) -> None:
+    monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setattr(bootstrap, "find_spec", lambda _name: None)
+    assert f"pip install '.[{extra}]'" in exits(2, line).err
+
+
 def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
     folder: Path, exits: Program
 ) -> None:
@@ -125,16 +143,16 @@ def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
 
 
 def test_a_deployment_that_records_there_is_looked_at_as_it_is(
-    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+    folder: Path, exits: Program, using: Using
 ) -> None:
     def budget(line: str) -> float | None:
         most: float | None = exits(0, line).json["memory_status"]["budget"]["max_gb"]
         return most
 
     own_all(folder)
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    using(folder)
     assert budget("info --json") == 5.0
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    using(folder, "robot")
     assert (budget("info . --json"), budget("info a --json")) == (5.0, None)
 
 
@@ -143,6 +161,8 @@ def test_topics_without_messages_are_named_and_all_faults_of_clocks(
 ) -> None:
     declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
     write_mcap(tmp_path / "a" / "a_0.mcap", seconds(0, 3), declared=declared)
+    odometry = ("/odom", "nav_msgs/msg/Odometry")  # of which another bag has messages
+    write_mcap(tmp_path / "b" / "b_0.mcap", [text(T0, "x")], declared=[odometry])
     for nth in range(12):
         boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
         write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
@@ -200,21 +220,19 @@ def test_each_recording_can_be_looked_at_alone(
 
 
 def test_what_is_forgotten_is_forgotten_of_one_recording_too(
-    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, exits: Program, using: Using
 ) -> None:
     own_all(folder)
     for bag in folder.rglob("*.mcap"):  # one that changed just now is not stored yet
         os.utime(bag, (1_700_000_000,) * 2)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
+    using(folder)
     counts = {"bags": 2, "stored": 2, "refused": 0}
-    assert exits(0, "index data.recording=a --json").json == counts
-    (store,) = folder.rglob("columns.sqlite")
+    assert exits(0, "index data.recording=a data.now=latest --json").json == counts
+    (store,) = tmp_path.rglob("columns.sqlite")
     with closing(sqlite3.connect(store)) as base:
         assert base.execute("SELECT count(*) FROM bag").fetchone() == (2,)
-    forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
-    assert exits(0, *forgetting).json["stays"] == []
+    forgetting = "forget --last 9000 --topic /chatter --yes --json data.now=latest"
+    assert exits(0, forgetting).json["stays"] == []
     # Without the bag that had some of it, and what has a part in common with that.
     with closing(sqlite3.connect(store)) as base:
         assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
@@ -230,13 +248,11 @@ def test_where_no_store_can_be_written_index_says_so(
 
 
 def test_index_fails_if_the_store_cannot_be_written(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program, using: Using
 ) -> None:
     for bag in folder.rglob("*.mcap"):
         os.utime(bag, (1_700_000_000,) * 2)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-
+    using(folder)
     transaction = database._transaction
 
     def fill_the_disk(connection: sqlite3.Connection, begin: str) -> AbstractContextManager[None]:
@@ -364,17 +380,13 @@ def test_a_window_of_a_day_or_a_minute_in_words_is_all_of_it(exits: Program) -> 
         "export --mcap copy.mcap",
         "index",
         "recover a",
-        "forget --last 100 --dry-run",
+        "forget --last 100 --dry-run data.now=latest",
         "adopt b",
     ],
 )
-def test_every_command_prints_json(
-    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, line: str
-) -> None:
+def test_every_command_prints_json(folder: Path, exits: Program, using: Using, line: str) -> None:
     own_all(folder)
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    using(folder)
     code = 1 if line.startswith("forget") else 0  # bags of others stay
     assert exits(code, line, "--json").json
 
@@ -386,9 +398,9 @@ def test_a_date_without_dashes_is_no_second_of_1970() -> None:
 
 
 def test_where_something_is_recorded_info_says_for_how_long_the_budget_lasts(
-    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+    folder: Path, exits: Program, using: Using
 ) -> None:
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    using(folder)
     recording_now(folder, "b", clock=later(0))
     shown = exits(0, "info deployment=robot retention.max_total_gb=2.0").out
     assert re.search(r"budget\.max_gb +2\n", shown)

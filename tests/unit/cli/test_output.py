@@ -71,6 +71,6 @@ def test_in_a_narrow_terminal_wide_rows_stand_one_below_the_other(shown: Shown) 
 @pytest.mark.parametrize("width", [0, 40])
 def test_however_narrow_a_terminal_is_nothing_of_a_table_is_cut(shown: Shown, width: int) -> None:
     """The width is 0 on some serial lines."""
-    output = shown([{"topic": "/a_long_name" * 5, "count": 12345}], width).out
-    assert "".join(output.split()).count("/a_long_name") >= 1
+    output = "".join(shown([{"topic": "/a_long_name" * 5, "count": 12345}], width).out.split())
     assert "12345" in output
+    assert "/a_long_name" * 5 in output.replace("12345", "")

@@ -16,7 +16,7 @@ from ros2_memory.cli import plot
 from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.places.local_map import east_north
-from tests.support.bags import battery, boolean, odom, text, write_mcap
+from tests.support.bags import along_x, battery, boolean, in_order, odom, text, write_mcap
 from tests.support.memories import memory_of
 from tests.support.program import Program
 
@@ -41,7 +41,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
         boolean(T0 + 12 * S, data=True),
         text(T0, "a $word$"),
     ]
-    write_mcap(folder / "rec" / "rec_0.mcap", sorted(first, key=lambda each: each.log_time))
+    write_mcap(folder / "rec" / "rec_0.mcap", in_order(first))
     begin = T0 + 60 * S
     second = [odom(begin + n * S // 5, 10.0, n / 5) for n in range(50)]
     write_mcap(folder / "rec" / "rec_1.mcap", second)
@@ -91,7 +91,7 @@ def test_the_path_of_a_time_that_a_wrong_clock_gave_is_drawn(
     tmp_path: Path, exits: Program
 ) -> None:
     for name, begin in (("rec", T0), ("unset", 1000 * S)):
-        poses = [odom(begin + n * S, n / 10, 0.0) for n in range(600)]
+        poses = along_x(begin, 600, mps=0.1)
         write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
     exits(0, f"plot path {tmp_path} --out {tmp_path}/x.svg --start 1000 --end 1600")
     assert (tmp_path / "x.svg").is_file()
@@ -163,13 +163,6 @@ def test_a_picture_that_cannot_be_written_leaves_the_one_before(
     refused = exits(2, f"plot path --out {out} {bags}")
     assert refused.err == f"ros2-memory plot path: {out}: No space left on device\n"
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"before"]
-
-
-def test_without_the_extra_it_names_the_command_that_installs_it(
-    bags: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.bootstrap.find_spec", lambda name: None)
-    assert "pip install '.[plot]'" in exits(2, f"plot path {bags} --out {tmp_path}/a.svg").err
 
 
 @given(

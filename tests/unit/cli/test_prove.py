@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tests.support.bags import McapLayout, Msg, detected, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, along_x, detected, odom, text, write_mcap
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.program import Program
 
@@ -27,7 +27,7 @@ def two_days(tmp_path: Path) -> Path:
     """Ten seconds a day on two days, each a recording."""
     for day in range(2):
         start = BEGIN + day * DAY_S * S
-        poses = [odom(start + nth * S // 10, nth / 20, 0.0) for nth in range(100)]
+        poses = along_x(start, 10, mps=0.5, hz=10)
         words = [text(start + nth * S, f"word {nth}") for nth in range(10)]
         write_mcap(tmp_path / "days" / f"rec_{day}" / f"rec_{day}_0.mcap", [*poses, *words])
     return tmp_path / "days"
@@ -100,7 +100,7 @@ def test_a_proof_has_all_that_an_answer_rests_on_however_long_reading_takes(
     for day in range(4):
         start = BEGIN + day * DAY_S * S
         seen = [detected(start + nth * S, [("cup", 0.9, (1.0, 0.0, 0.5))]) for nth in range(20)]
-        poses = [odom(start + nth * S // 5, 0.0, 0.0) for nth in range(100)]
+        poses = along_x(start, 20, hz=5)
         write_mcap(tmp_path / "bags" / f"rec_{day}" / f"rec_{day}_0.mcap", [*seen, *poses])
     proof = tmp_path / "proof"
     proved = exits(0, "prove", "find_things label=cup", "-o", proof, tmp_path / "bags")

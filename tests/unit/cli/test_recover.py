@@ -14,7 +14,7 @@ from ros2_memory.cli import output
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, is_foreign, recover_files
 from ros2_memory.core.directories import identity_of
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
+from tests.support.bags import McapLayout, along_x, typestore, write_db3, write_mcap
 from tests.support.housekeepers import copied, files_in, later, recording_now
 from tests.support.program import Program
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -22,7 +22,7 @@ from tests.support.shared_bags import RECORDED, needs_recorded
 S = 10**9
 T0 = 1_790_000_000 * S
 ODOMETRY = "nav_msgs/msg/Odometry"
-MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(100)]
+MESSAGES = along_x(T0, 5, mps=1, hz=20)
 
 
 def left_open(path: Path) -> Path:

@@ -1,7 +1,6 @@
 """`ros2-memory ship`: one pass, who writes, what is missing, and no secret anywhere."""
 
 import csv
-import importlib.util
 import json
 import os
 import shutil
@@ -14,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from ros2_memory import bootstrap, bootstrap_fleet, cli
+from ros2_memory import bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
@@ -41,14 +40,19 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program) -> Ship:
-    """Runs one pass into a lake of its own, which must end with a code."""
+def settings(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Of a lake of its own for these robots."""
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]
+
+
+@pytest.fixture
+def ship(settings: list[str], exits: Program) -> Ship:
+    """Runs one pass into the lake, which must end with a code."""
 
     def run(code: int, *more: object) -> Printed:
-        settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake", *more]
-        return exits(code, "ship --once --json lake.commit_interval_s=0", *settings)
+        return exits(code, "ship --once --json lake.commit_interval_s=0", *settings, *more)
 
     return run
 
@@ -95,10 +99,8 @@ def test_a_time_of_a_robot_that_is_known_is_forgotten_and_stays_so(
 
 
 def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     claimed = LakeLocation.claim
     waited: list[float] = []
 
@@ -115,7 +117,6 @@ def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
 
     monkeypatch.setattr(LakeLocation, "claim", claim)
     monkeypatch.setattr(ship_module, "_wait", wait)
-    settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]
     assert cli.main(["ship", *settings]) == 130
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
 
@@ -160,14 +161,6 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     assert "its bags last changed" in told["lake ok"][0]
     shutil.rmtree(lake / "ros2_memory")
     assert "looking into the lake failed" in found()["lake error"][0]
-
-
-def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        bootstrap, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
-    )
-    assert "pip install '.[lake]'" in ship(2).err
 
 
 def test_no_secret_is_in_an_error_or_in_the_configuration(

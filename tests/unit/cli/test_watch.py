@@ -14,10 +14,11 @@ from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap, write_splits
 from tests.support.heartbeats import beat
 from tests.support.program import Program
+from tests.unit.cli.conftest import Using
 
 
 @pytest.fixture(autouse=True)
-def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def bag_dir(tmp_path: Path, using: Using) -> Path:
     """A minute at 10 Hz, in which one topic falls silent and another becomes slow."""
     now, messages = time.time_ns(), []
     for n in range(600):
@@ -26,8 +27,7 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         messages += [text(at, "x")] * (n < 300 and n % 10 == 0)
         messages += [boolean(at, data=True)] * (n % (10 if n < 500 else 50) == 0)
     write_splits(tmp_path, messages)
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "query_only")
+    using(tmp_path, "query_only")
     return tmp_path
 
 
