@@ -37,7 +37,7 @@ from ros2_memory.recorder.handover import (
 )
 from ros2_memory.recorder.sessions import Splits
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, in_order, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.handovers import recover_handovers
 from tests.support.mcap_surgery import spoil_chunk
@@ -99,7 +99,7 @@ class Recorder(NamedTuple):
                 queues.setdefault((stall, each.topic), []).append(message)
         for queue in queues.values():
             received += queue[-self.depth :]
-        return sorted(received, key=lambda each: each.log_time)
+        return in_order(received)
 
     def writes(self, directory: Path, published: Iterable[Published]) -> None:
         messages = self.receives(published)

@@ -70,19 +70,6 @@ def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
     return events(captured, event)
 
 
-@pytest.mark.parametrize("link", [".ros_log", "moments/x"])
-def test_the_budget_counts_nothing_behind_a_link(tmp_path: Path, link: str) -> None:
-    bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
-    first, *_ = recording(bags, "a", 0)
-    total = size_of(bags)
-    elsewhere.mkdir()
-    (elsewhere / "moment.json").write_bytes(bytes(5000))
-    (bags / link).parent.mkdir(exist_ok=True)
-    (bags / link).symlink_to(elsewhere)
-    keeper_of(bags, max_bytes=total).apply()
-    assert first.exists()
-
-
 def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(tmp_path: Path) -> None:
     """What rules need is not held by the clock."""
     old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
@@ -170,17 +157,26 @@ def test_a_bag_goes_with_its_unfinished_compressed_form_and_with_its_journals(
     assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
 
 
-def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(tmp_path: Path) -> None:
-    first, *_ = recording(tmp_path, "a", 0)
-    left_open(tmp_path / "b" / "b_0.mcap", 100)
+def test_the_budget_counts_sidecars_open_bags_and_what_is_derived_and_nothing_behind_a_link(
+    tmp_path: Path,
+) -> None:
+    bags, log = tmp_path / "bags", tmp_path / "log"
+    first, *_ = recording(bags, "a", 0)
+    left_open(bags / "b" / "b_0.mcap", 100)
     for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_bytes(bytes(5000))
-    recording_now(tmp_path, "b")
-    total = size_of(tmp_path)
-    keeper_of(tmp_path, max_bytes=total).apply()
+        (bags / name).parent.mkdir()
+        (bags / name).write_bytes(bytes(5000))
+    recording_now(bags, "b")
+    total = size_of(bags)
+    keeper_of(bags, max_bytes=total).apply()
     assert first.exists()
-    keeper_of(tmp_path, max_bytes=total - 1).apply()
+    (bags / ".ros_log").rename(log)
+    (bags / "moments").mkdir()
+    for link in (".ros_log", "moments/x"):
+        (bags / link).symlink_to(log)
+    keeper_of(bags, max_bytes=total - 5000).apply()
+    assert first.exists()
+    keeper_of(bags, max_bytes=total - 5001).apply()
     assert not first.exists()
 
 
@@ -200,26 +196,18 @@ def test_never_deleted_is_what_is_no_closed_bag_of_a_recording_or_is_being_writt
     bag(bags / "z/z_0.mcap", 100)
     (bags / "z/z_9.mcap").symlink_to(kept[0])
     (bags / "x").symlink_to(outside / "x", target_is_directory=True)
-    recording_now(bags, "b", clock=later(0))  # though its heartbeat is old
-    keeper_of(bags, max_bytes=1).apply()
+    bag(bags / "d/d_0.mcap", 70)
+    recording_now(bags, "b", "d", clock=later(0))  # though its heartbeat is old
+    keeper = keeper_of(bags, max_bytes=1)
+    keeper.apply()
+    assert "d" in files_in(bags)
+    recording_now(bags, "b", clock=later(0))
+    keeper.apply()
+    assert "d" not in files_in(bags)
     left = ["a/.hidden.tmp", "a/notes.txt", "b/b_1.mcap", "b/handover.json", "c/c_0.mcap"]
     left += ["z/z_0.mcap", "z/z_9.mcap"]
     assert [name for name in files_in(bags) if name.count("/") and name[0] != "x"] == left
     assert all(path.exists() for path in (*kept, bags / "x" / kept[0].name))
-
-
-def test_never_deleted_is_the_directory_of_a_recording_that_is_being_written(
-    tmp_path: Path,
-) -> None:
-    bag(tmp_path / "a/a_0.mcap", 0)
-    bag(tmp_path / "b/b_0.mcap", 100)
-    recording_now(tmp_path, "a")
-    keeper = keeper_of(tmp_path, max_bytes=1)
-    keeper.apply()
-    assert files_in(tmp_path)[0] == "a"
-    recording_now(tmp_path, "b")
-    keeper.apply()
-    assert files_in(tmp_path)[0] == "b"
 
 
 def test_deletions_that_fail_are_told_and_written_down_once_and_do_not_stop_the_rest(

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.core.model import BagFile, BagState, SetAside
+from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
@@ -166,27 +166,3 @@ def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
     assert (damaged["reason"], Path(damaged["path"]).name) == ("the file is empty", "rec_1.mcap")
     counts = [scanned[key] for key in ("event", "bags", "added", "removed", "damaged", "active")]
     assert counts == ["index_scanned", 1, 1, 0, 1, 0]
-
-
-def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
-    yard.split(0, [0, 9], silent=["/scan", "/lost"])
-    yard.split(1, [10, 19], topic="/scan")
-    yard.split(2, silent=["/idle"])
-    yard.split(3, [30], closed=False)
-    (yard.bag_dir / "rec" / "rec_4.mcap").touch()
-    plain(yard.bag_dir / "old" / "old_0.db3", [1])
-    (yard.bag_dir / "latest").symlink_to(yard.bag_dir / "rec", target_is_directory=True)
-    yard.age()
-    yard.split(5, [40], closed=False)
-    os.utime(yard.bag_dir / "rec" / "rec_5.mcap", ns=(NOW, NOW))
-    snapshot = yard.index.refresh()
-    assert [(bag.path.name, bag.state) for bag in snapshot.bags] == [
-        ("rec_0.mcap", BagState.CLOSED),
-        ("rec_1.mcap", BagState.CLOSED),
-        ("rec_3.mcap", BagState.INCOMPLETE),
-    ]
-    assert _names(snapshot.active) == ["rec_5.mcap"]
-    assert _names(snapshot.damaged) == ["rec_4.mcap"]
-    assert _names(snapshot.unread) == ["latest", "old_0.db3"]
-    assert [path.name for path in snapshot.empty] == ["rec_2.mcap"]
-    assert snapshot.silent_topics == {"/lost", "/idle"}

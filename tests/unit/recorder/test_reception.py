@@ -58,6 +58,14 @@ def reception(bag_dir: Path, **how: Any) -> Reception:
     return Reception(McapReader(), 2**26, bag_dir=bag_dir, background=Inline(), **given)
 
 
+@pytest.fixture
+def made(tmp_path: Path) -> Reception:
+    """The reception of a recorder whose first recording, `a`, has its overrides."""
+    made = reception(tmp_path)
+    made.overrides("a")
+    return made
+
+
 def latched_split(path: Path, *topics: str) -> Path:
     """Nine messages of each topic, whose publishers are transient local."""
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
@@ -84,13 +92,16 @@ def rotated(of: Reception, recording: str, now_s: float) -> Rotation:
 
 
 def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: Path) -> None:
+    """An override names the whole profile, but no deadline."""
     made = reception(tmp_path)
-    assert profiles(made, "a").keys() == {"/tf_static"}
+    every = {"history": "keep_all", "reliability": "reliable", "durability": "transient_local"}
+    assert profiles(made, "a") == {"/tf_static": every}
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = rotated(made, "a", 10.0)
     assert (rotation.event, {*rotation.topics}) == ("queues_deepened", {"/odom"})
-    assert profiles(made, "b")["/odom"]["depth"] == 200
+    last = {"history": "keep_last", "reliability": "reliable", "durability": "volatile"}
+    assert profiles(made, "b")["/odom"] == {**last, "depth": 200}
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
     assert made.rotation_due("b", 1000.0) is None
     # Topics that come one by one do not rotate one by one.
@@ -114,9 +125,9 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
 
 
-def test_a_topic_taken_for_latched_whose_publisher_is_volatile_adapts_too(tmp_path: Path) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
+def test_a_topic_taken_for_latched_whose_publisher_is_volatile_adapts_too(
+    tmp_path: Path, made: Reception
+) -> None:
     made.note_refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
     made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
@@ -125,12 +136,11 @@ def test_a_topic_taken_for_latched_whose_publisher_is_volatile_adapts_too(tmp_pa
 
 
 def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_heard(
-    tmp_path: Path,
+    tmp_path: Path, made: Reception
 ) -> None:
     """A split names the publishers that its recording had discovered, often not all."""
-    made, topics = reception(tmp_path), ("/map", "/tf_static")
+    topics = ("/map", "/tf_static")
     latched = latched_split(tmp_path / "a.mcap", *topics)
-    made.overrides("a")
     made.learn("a", latched)
     for topic in topics:
         made.note_refused("a", topic)
@@ -148,11 +158,9 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
 
 
 def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_has_gone(
-    tmp_path: Path,
+    tmp_path: Path, made: Reception
 ) -> None:
-    made = reception(tmp_path)
     splits = [split(tmp_path / f"a_{nth}.mcap", 5, 4) for nth in range(2)]
-    made.overrides("a")
     made.learn("a", splits[0])
     weaker = TopicFlow(OfferedQos(reliable=False, latched=False, publishers=2), 10, 700)
     measured = measure_split(McapReader(), splits[0])._replace(flows={"/odom": weaker})
@@ -162,9 +170,9 @@ def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_h
     assert profiles(made, "b")["/odom"]["reliability"] == "best_effort"
 
 
-def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
+def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(
+    tmp_path: Path, made: Reception
+) -> None:
     made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
     made.note_refused("a", "/odom")
     made.overrides("b")
@@ -176,10 +184,8 @@ def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_p
 
 
 def test_what_a_refused_publisher_sent_is_missing_after_the_clock_was_set_back(
-    tmp_path: Path,
+    tmp_path: Path, made: Reception
 ) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
     made.note_refused("a", "/odom")
     for number, begin in enumerate((0, 10, -40, -30)):
         at = T0 + begin * NS
@@ -192,11 +198,9 @@ def test_what_a_refused_publisher_sent_is_missing_after_the_clock_was_set_back(
 
 
 def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reception_module, "_MOST_UNWRITTEN", 2)
-    made = reception(tmp_path)
-    made.overrides("a")
     made.note_refused("a", "/odom")
     made.may_write = False
     with capture_logs() as log:
@@ -209,25 +213,11 @@ def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
     assert len(read_losses(tmp_path, MIN_NS, MAX_NS)) == 2
 
 
-def test_of_a_huge_split_the_end_shows_bursts_and_no_holes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = split(tmp_path / "a_0.mcap", 50, 10)
-    whole = measure_split(McapReader(), path)
-    assert len(whole.progress["/odom"].positions) == 500
-    monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
-    tail = measure_split(McapReader(), path)
-    assert tail.flows == whole.flows
-    assert tail.progress == {}
-
-
 @pytest.mark.parametrize("seconds", [10, 20])
 def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int
+    tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch, seconds: int
 ) -> None:
     monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
-    made = reception(tmp_path)
-    made.overrides("a")
     for number in range(4):
         at = T0 + number * seconds * NS
         odometry = [odom(at + tick * NS // 20, 1.0, 2.0) for tick in range(20 * seconds)]
@@ -239,12 +229,13 @@ def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
     assert rates_hz == pytest.approx({"/odom": 20, "/chatter": 1 / seconds}, rel=0.01)
     silent, _ = made.arrivals(11 * NS)
     assert silent == {"/odom"}
+    assert profiles(made, "b")["/odom"]["depth"] == 80
 
 
-def test_a_latched_message_that_begins_each_split_again_changes_no_rate(tmp_path: Path) -> None:
+def test_a_latched_message_that_begins_each_split_again_changes_no_rate(
+    tmp_path: Path, made: Reception
+) -> None:
     """Its log time is that of long before: see `recorder.repeat_latched`."""
-    made = reception(tmp_path)
-    made.overrides("a")
     layout = McapLayout(latched=frozenset({"/map_name"}))
     for number in range(4):
         begin = T0 + number * 10 * NS
@@ -261,10 +252,8 @@ def test_a_latched_message_that_begins_each_split_again_changes_no_rate(tmp_path
 
 @pytest.mark.parametrize(("period_s", "falls_silent"), [(6, False), (2, True)])
 def test_a_latched_topic_is_silent_until_something_changes(
-    tmp_path: Path, period_s: int, falls_silent: bool
+    tmp_path: Path, made: Reception, period_s: int, falls_silent: bool
 ) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
     for number in range(10):
         begin = T0 + number * 30 * NS
         states = [text(begin + s * NS, "here", "/mode") for s in range(0, 30, period_s)]
@@ -275,10 +264,8 @@ def test_a_latched_topic_is_silent_until_something_changes(
 
 
 def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = reception(tmp_path)
-    made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 20, 10))
     made.note_lost("a", "/odom", 3, (0, 1))  # which the stamps of that split would show
     assert read_losses(tmp_path, MIN_NS, MAX_NS) == []
@@ -329,6 +316,7 @@ def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> 
     )
     made.skip_latched(["/map", "/tf_static", "/shared", "/unknown"])
     latched, volatile = ("reliable", "transient_local"), ("reliable", "volatile")
+    assert profiles(made, "b")["/plan"]["depth"] == 10
     assert qos(made, "b") == {
         "/map": volatile,
         "/tf_static": volatile,
@@ -393,25 +381,6 @@ def test_queues_hold_two_seconds_or_are_named_and_fit_in_their_memory(
     for topic, flow in flows.items():
         assert (plan.depths[topic] < flow.burst) == (topic in plan.cut_short)
         assert plan.depths[topic] >= 1
-
-
-def test_an_override_names_the_whole_profile_but_no_deadline(tmp_path: Path) -> None:
-    made = reception(tmp_path, latched=["/tf_static", "/unseen"])
-    made._flows = {
-        "/odom": TopicFlow(RELIABLE, 100, 700),
-        "/scan": TopicFlow(OfferedQos(reliable=False, latched=False), 20, 700),
-        "/map": TopicFlow(OfferedQos(reliable=True, latched=True), 1, 700),
-        "/tf_static": TopicFlow(OfferedQos(reliable=True, latched=True), 1, 700),
-    }
-    every = {"history": "keep_all", "reliability": "reliable", "durability": "transient_local"}
-    last = {"history": "keep_last", "reliability": "reliable", "durability": "volatile"}
-    assert profiles(made, "a") == {
-        "/odom": {**last, "depth": 200},
-        "/scan": {**last, "depth": 40, "reliability": "best_effort"},
-        "/map": {**last, "depth": 10, "durability": "transient_local"},
-        "/tf_static": every,
-        "/unseen": every,
-    }
 
 
 PERIOD = NS // 50

@@ -89,22 +89,6 @@ def test_a_recorder_that_dies_before_its_first_byte_leaves_no_directory(tmp_path
     assert not world.recorders[0].directory.exists()
 
 
-def test_a_new_recorder_that_dies_in_a_handover_counts_for_nothing(tmp_path: Path) -> None:
-    world = rotating(tmp_path, 22.5)
-    old, new = world.recorders
-    new.die()
-    with capture_logs() as logs:
-        world.run(1)
-    assert (len(events(logs, "recorder_died")), events(logs, "recorder_hung")) == (1, [])
-    assert world.heartbeat()["restarts"] == 1
-    assert old.status is None
-    assert read_handover(new.directory).handover.hides_all
-    assert read_handover(old.directory).handover.next is None
-    world.run(15)
-    assert len(world.recorders) == 3
-    assert_each_counts_once(world)
-
-
 def test_where_the_disk_does_not_list_recordings_handovers_are_settled_later(
     tmp_path: Path,
 ) -> None:
@@ -272,16 +256,13 @@ def test_while_it_pauses_room_is_asked_for_again_and_the_pause_is_noted_at_its_e
     assert 0 <= since - paused <= 2 * NS_PER_S
 
 
-def test_each_split_that_stays_empty_is_reported(world: World) -> None:
-    world.disk_full = True
-    reasons = [each["reason"] for each in world.logged(35, "split_empty")]
-    assert len({*reasons}) == len(reasons) >= 2
-
-
-def test_once_a_newer_split_is_closed_an_empty_one_is_past(world: World) -> None:
+def test_each_split_that_stays_empty_is_reported_and_past_once_a_newer_one_is_closed(
+    world: World,
+) -> None:
     world.run(5)
     world.disk_full = True
-    world.run(12)
+    reasons = [each["reason"] for each in world.logged(14.5, "split_empty")]
+    assert len({*reasons}) == len(reasons) >= 2
     world.disk_full = False
     for after_s, is_past in ((2, False), (18, True)):
         world.run(after_s)
@@ -331,7 +312,7 @@ def test_nothing_is_recorded_onto_another_disk_and_it_goes_on_when_the_disk_is_b
 
 
 @pytest.mark.parametrize("how", ["died", "hung"])
-def test_nothing_is_lost_with_a_recorder_that_has_not_taken_over_yet(
+def test_nothing_is_lost_with_a_recorder_that_has_not_taken_over_yet_and_counts_for_nothing(
     tmp_path: Path, how: str
 ) -> None:
     world = rotating(tmp_path, 22, housekeeper=keeper_of(tmp_path))
@@ -341,10 +322,20 @@ def test_nothing_is_lost_with_a_recorder_that_has_not_taken_over_yet(
     else:
         new.ends_with = -9
         world.set_clock(-3600)
-    world.run(3)
+    with capture_logs() as logs:
+        world.run(1)
+        assert how == "hung" or read_handover(old.directory).handover.next is None
+        world.run(2)
+    found = [len(events(logs, f"recorder_{name}")) for name in ("died", "hung")]
+    assert found == ([1, 0] if how == "died" else [0, 1])
     assert (old.status, new.status) == (None, -9)
     assert world.heartbeat()["restarts"] == 1
     assert lost_in(tmp_path) == []
+    assert read_handover(new.directory).handover.hides_all
+    if how == "died":
+        world.run(15)
+        assert len(world.recorders) == 3
+        assert_each_counts_once(world)
 
 
 def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(tmp_path: Path) -> None:
