@@ -14,6 +14,7 @@ from tests.support.bags import (
     Msg,
     battery,
     boolean,
+    in_order,
     odom,
     text,
     tf,
@@ -54,8 +55,7 @@ def written(folder: Path, at_beat: Callable[[float], Iterable[Msg]]) -> Memory:
     for number in range(SPLITS):
         beats = range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ)
         messages = [message for beat in beats for message in at_beat(beat / HZ)]
-        messages.sort(key=lambda message: message.log_time)
-        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+        write_mcap(folder / "rec" / f"rec_{number}.mcap", in_order(messages))
     return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
 
@@ -127,9 +127,8 @@ def test_the_age_of_a_latched_value_is_without_what_the_clock_skipped(tmp_path: 
     for beat in range(160 * HZ):
         at = BEGIN * S + beat * S // HZ + 500 * S * (beat > 549)
         messages += [odom(at, SPEED * beat / HZ), boolean(at + 1, data=False)]
-    messages.sort(key=lambda message: message.log_time)
     layout = McapLayout(latched=frozenset({"/mode"}))
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, layout)
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", in_order(messages), layout)
     plain = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
     for memory in each_known(plain):
         found = asked(memory, "get_topic_at_time", topic="/mode", timestamp=BEGIN + 600)
@@ -327,7 +326,7 @@ def at_rates(slow: Sequence[tuple[float, float]] = ()) -> list[Msg]:
     messages += [boolean(at(t), data=True) for t in flags if is_on(t, fast)]
     texts = [n / 10 + 0.001 for n in range(10 * LENGTH)]
     messages += [text(at(t), "here") for t in texts if is_on(t, STALLS)]
-    return sorted(messages, key=lambda message: message.log_time)
+    return in_order(messages)
 
 
 def memory_with(

@@ -20,7 +20,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Sightings
 from ros2_memory.tools.arguments import _as_hours
 from ros2_memory.tools.replies import as_json
-from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import along_x, boolean, detections, odom, text, tf, transform, write_mcap
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, memory_of, remembered
 from tests.support.rooms import S, asked_of, draw, write
@@ -251,7 +251,7 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
 def test_a_window_with_too_many_messages_to_read_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    memory = remembered(tmp_path, [odom((T0 + n) * S, n) for n in range(9)])
+    memory = remembered(tmp_path, along_x(T0 * S, 9, mps=1))
     window = {"start": T0 * S / S, "end": T0 * S / S + 100, "fields": ["pose.covariance"]}
     whole = asked(memory, "get_topic_in_range", topic="/odom", **window)
     assert whole["extremes"]["pose.covariance"]["min"] == 0.0

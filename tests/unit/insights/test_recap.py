@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from operator import attrgetter
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
@@ -22,12 +21,14 @@ from ros2_memory.results import Recap
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     battery,
     boolean,
     command,
     detections,
     diagnostics,
     goals,
+    in_order,
     log_entry,
     make,
     odom,
@@ -151,7 +152,7 @@ def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Pa
 
     messages = [lands(second, landed=not 20 <= second < 40) for second in range(60)]
     messages += [boolean(BEGIN + second * S, second >= 18, "/armed") for second in range(60)]
-    messages += [odom(BEGIN + second * S) for second in range(60)]
+    messages += along_x(BEGIN, 60)
     memory = remembered(tmp_path, messages)
     events = asked(memory, "recap", start=T0, end=T0 + 60)["events"]
     flips = [event for event in events if "became" in event["text"]]
@@ -238,7 +239,7 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     """A robot that drives at 0.5 m/s, recorded for 20 s, an hour later, and another hour later."""
     for run in range(3):
         begin = BEGIN + run * 3600 * S
-        body = [odom(begin + n * S // 10, n * 0.05) for n in range(200)]
+        body = along_x(begin, 20, mps=0.5, hz=10)
         body += [boolean(begin + n * S, n < 5, "/bumper") for n in range(20)]
         write_mcap(tmp_path / f"run{run}" / f"run{run}_0.mcap", body)
     memory, window = memory_of(tmp_path), {"start": T0, "end": T0 + 7220}
@@ -390,7 +391,7 @@ def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Pat
     """As after a restart, before the initial pose is known."""
     stood = [odom(at(nth)) for nth in range(60)]
     placed = [tf(at(nth), transform(at(nth), "map", "odom", (7, 2, 0))) for nth in range(40, 60)]
-    write_mcap(tmp_path / "bag.mcap", sorted([*stood, *placed], key=attrgetter("log_time")))
+    write_mcap(tmp_path / "bag.mcap", in_order([*stood, *placed]))
     reply = asked(memory_of(tmp_path), "recap", start=at(0) / S, end=at(59) / S)
     assert [event["text"] for event in reply["events"]] == ["stood at x 7.00, y 2.00"]
 
@@ -517,8 +518,7 @@ def test_what_a_window_first_lists_as_ended_just_did_if_the_message_before_it_is
 ) -> None:
     beats = [odom(BEGIN + at * S + 1) for at in range(60) if at not in pause]
     messages = [*beats, *before, *history((42, {1: 4, 2: 6}))]
-    messages.sort(key=lambda message: message.log_time)
-    found = told_goals(tmp_path, messages, 35, 52, 5, recalls=False)
+    found = told_goals(tmp_path, in_order(messages), 35, 52, 5, recalls=False)
     assert [text for _, text, *_ in found] == ["/drive goal aborted after 0 s"] * is_told
     window = {"start": T0 + 35, "end": T0 + 52}
     searched = found_in(memory_of(tmp_path), "equals", "failed", **window)
@@ -546,7 +546,7 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     tmp_path: Path,
 ) -> None:
     """Active from 10 to 40 s (34:00), another from 60 s on, which a restart at 99 s cuts short."""
-    messages = [odom(BEGIN + at * S, at / 10) for at in range(100)]
+    messages = along_x(BEGIN, 100, mps=0.1)
     messages += history((10, {1: 2}), (40, {1: 4}), (60, {1: 4, 2: 2}))
     write_splits(tmp_path, messages, layout=McapLayout(latched=frozenset({TOPIC})))
     write_splits(tmp_path, [odom(BEGIN + at * S) for at in range(900, 950)], name="next")
@@ -570,10 +570,10 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
 def test_what_feedback_says_holds_while_there_is_feedback(tmp_path: Path) -> None:
     """Of two goals, a minute apart; a bumper that is as quiet in between stays pressed."""
     said = {at: at >= 5 for at in range(8)} | {at: at >= 65 for at in range(60, 68)}
-    messages = [odom(BEGIN + at * S) for at in range(100)]
+    messages = along_x(BEGIN, 100)
     for topic in ("/grip/_action/feedback", "/bumper"):
         messages += [boolean(BEGIN + at * S, value, topic=topic) for at, value in said.items()]
-    messages.sort(key=lambda message: message.log_time)
+    messages = in_order(messages)
     flips = [
         each for each in over(remembered(tmp_path, messages), 0, 99).events if each.kind == "flip"
     ]
@@ -593,8 +593,7 @@ def test_while_a_goal_was_executing_is_asked_by_that_word(tmp_path: Path) -> Non
     """Executing from 10 to 20 s and from 30 to 35 s; the first one stays listed as succeeded."""
     messages = [*history((5, {1: 1}), (10, {1: 2}), (20, {1: 4}), (30, {1: 4, 2: 2}), (35, {2: 6}))]
     messages += [boolean(BEGIN + at * S, True, topic="/bump") for at in (7, 15, 25, 32, 38)]
-    messages.sort(key=lambda message: message.log_time)
-    memory = remembered(tmp_path, messages)
+    memory = remembered(tmp_path, in_order(messages))
 
     def bumps(kind: str, word: str | int, **more: object) -> Any:
         during = {"topic": TOPIC, "condition_type": kind, "value": word} | more
@@ -687,7 +686,7 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
 
 
 def test_a_comparison_says_which_of_the_two_paths_has_a_gap(tmp_path: Path) -> None:
-    legs = [odom(BEGIN + n * S // 10, n / 50) for n in range(300)]
+    legs = along_x(BEGIN, 30, mps=0.2, hz=10)
     legs += [odom(BEGIN + 60 * S + n * S // 10, 10.0 + n / 50) for n in range(300)]
     memory = remembered(tmp_path, legs)
     whole, part = (T0, T0 + 90), (T0, T0 + 20)
@@ -708,7 +707,7 @@ def test_how_far_it_is_across_a_gap_is_unknown_where_odometry_began_anew(
 ) -> None:
     """It drives 6 m; the next recording begins at 2 m, of another origin if not in the map."""
     begin = 1_700_000_000 * S
-    legs = [[odom(begin + n * S // 10, n / 50) for n in range(300)]]
+    legs = [along_x(begin, 30, mps=0.2, hz=10)]
     legs.append([odom(begin + (60 + n) * S, 2.0) for n in range(30)])
     for number, leg in enumerate(legs):
         write_splits(tmp_path / "several", leg, 1000.0, f"run{number}")

@@ -18,7 +18,16 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Memory, QuerySettings
-from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap, write_splits
+from tests.support.bags import (
+    Msg,
+    boolean,
+    detections,
+    in_order,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.clocks import FixedClock
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
@@ -124,7 +133,7 @@ def draw_recordings(draw: Random) -> dict[str, list[Msg]]:
         ]
     for name in others:
         found[name] = _published(draw, 2, 12)
-    return {name: sorted(some, key=lambda each: each.log_time) for name, some in found.items()}
+    return {name: in_order(some) for name, some in found.items()}
 
 
 def write_cut(

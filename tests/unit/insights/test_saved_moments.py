@@ -14,7 +14,6 @@ from ros2_memory.bag_dir.moment_file import (
     PendingRequest,
     SavedMoment,
     SaveRequest,
-    StoredMoment,
     make_moment_folder,
     write_saved_moment,
 )
@@ -33,6 +32,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies, as_json
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.fakes import broken
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of, recorder_at_work
 from tests.support.memories import asked, memory_of
@@ -188,29 +188,17 @@ def test_rules_are_told_with_how_often_they_fired_and_what_of_a_moment_is_not_ke
     assert asked(memory, "memory_status")["rules"] == told["rules"]
 
 
-def test_a_status_says_that_moments_cannot_be_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(_bag_dir: Path) -> list[StoredMoment]:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(saved_moments, "stored_moments_in", refused)
-    status = asked(memory_of(tmp_path), "memory_status")
+def test_what_keeps_moments_from_being_listed_is_said_and_its_file_named(tmp_path: Path) -> None:
+    memory = memory_of(tmp_path)
+    with broken(saved_moments, "stored_moments_in", errno.EACCES):
+        status = asked(memory, "memory_status")
+        with pytest.raises(RefusedError, match="Permission denied"):
+            list_moments(memory, Call())
     assert "moments" not in status
     assert "the moments cannot be listed: Permission denied" in str(status["notes"])
-    with pytest.raises(RefusedError, match="Permission denied"):
-        list_moments(memory_of(tmp_path), Call())
-
-
-def test_the_file_that_keeps_moments_from_being_listed_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(_self: object, _bag_dir: Path) -> None:
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr(type(TRIGGERS), "read", refused)
-    with pytest.raises(RefusedError, match=r"be allowed to read \.episodic/triggers\.json of"):
-        list_moments(memory_of(tmp_path), Call())
+    said = r"be allowed to read \.episodic/triggers\.json of"
+    with broken(type(TRIGGERS), "read", errno.EACCES), pytest.raises(RefusedError, match=said):
+        list_moments(memory, Call())
 
 
 def test_a_moment_that_cannot_be_read_is_named(tmp_path: Path) -> None:

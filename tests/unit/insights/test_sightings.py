@@ -27,10 +27,12 @@ from ros2_memory.tools.replies import as_json
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     battery,
     boolean,
     detections,
     diagnostics,
+    in_order,
     log_entry,
     make,
     octets,
@@ -165,7 +167,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
         for pair in [("map", "odom"), ("odom", "base_link")]
     ]
     seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
-    poses = [odom(BEGIN + at * S, 0.5 * at) for at in range(3)]
+    poses = along_x(BEGIN, 3, mps=0.5)
     memory = remembered(tmp_path, [*placed, *seen, *poses])
     for frame_id in (None, "odom"):
         answer = find_matches(memory, Call(), Sought(OBJECTS, "contains", "cup"), frame_id=frame_id)
@@ -221,7 +223,7 @@ def test_the_robot_is_where_it_was_last_if_the_first_match_is_before_its_first_p
     """As at the begin of a recording, in which topics come one after the other."""
     poses = [odom(BEGIN + n * S // 10, n / 10) for n in range(first_pose, 30)]
     flags = [boolean(BEGIN + n * S // 10 + 1000, True) for n in range(30)]
-    memory = remembered(tmp_path, sorted([*poses, *flags], key=lambda message: message.log_time))
+    memory = remembered(tmp_path, in_order([*poses, *flags]))
     is_on = {"topic": "/bumper", "condition_type": "equals", "value": True}
     [sighting] = asked(memory, "find_matches", **is_on)["sightings"]
     assert (sighting["robot"]["at"], sighting["robot"]["x"]) == (at, x)
@@ -562,7 +564,7 @@ def test_the_last_text_of_all_is_found_from_its_own_time_on_and_follows_itself_n
     tmp_path: Path, recalls: bool
 ) -> None:
     said = {5: "fetch", 20: "", **dict.fromkeys(range(30, 61), "dock")}
-    drive = [odom((T0 + nth) * S) for nth in range(61)]
+    drive = along_x(T0 * S, 61)
     write_mcap(tmp_path / "run" / "run_0.mcap", drive)
     texts = [text((T0 + at) * S, word) for at, word in said.items()]
     write_mcap(tmp_path / "run" / "run_1.mcap", texts)
@@ -637,7 +639,7 @@ def test_a_state_without_an_empty_text_holds_until_the_next_one(
 ) -> None:
     """A word every 60 s, and the robot's pose until 300 s."""
     said = [text(BEGIN + (60 * nth + 5) * S, word, "/mode") for nth, word in enumerate(words)]
-    drive = [odom(BEGIN + at * S, at / 10) for at in range(301)]
+    drive = along_x(BEGIN, 301, mps=0.1)
     memory = remembered(tmp_path, [*said, *drive], recalls=recalls)
     given = {"topic": "/mode", "condition_type": "equals", "value": words[0]}
     reply = asked(memory, "find_matches", **given)
@@ -685,7 +687,7 @@ def test_the_robot_is_where_a_thinned_day_has_it_if_a_bag_between_was_deleted(
     tmp_path: Path, since_s: float, x: float, recalls: bool
 ) -> None:
     """Between two bags of one run there was another, of which poses stayed, or none."""
-    first = [odom(BEGIN + nth * S // 10, nth / 10) for nth in range(105)]
+    first = along_x(BEGIN, 10.5, mps=1, hz=10)
     last = [odom(BEGIN + nth * S // 10, nth / 10) for nth in range(156, 300)]
     last.insert(0, text(BEGIN + 155 * S // 10, "hello"))
     write_mcap(tmp_path / "rec" / "rec_0.mcap", first)
@@ -761,8 +763,7 @@ def test_with_takes_a_field_of_a_topic_whose_messages_have_several(
 ) -> None:
     messages = [boolean(BEGIN + at * S, 10 <= at < 20, "/bumper") for at in range(30)]
     messages += [battery(BEGIN + at * S, 0.5 if at < 12 else 0.4) for at in range(0, 30, 4)]
-    messages.sort(key=lambda message: message.log_time)
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remembered(tmp_path, in_order(messages), recalls=recalls)
     bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
     by_field = {"with": "/battery_state.percentage", **bumped}
     [row] = asked(memory, "find_matches", **by_field)["sightings"]

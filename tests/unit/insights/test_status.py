@@ -21,9 +21,11 @@ from ros2_memory.retention.policy import RetentionLimits
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     boolean,
     detections,
     goals,
+    in_order,
     log_entry,
     make,
     odom,
@@ -43,7 +45,7 @@ BEGIN = T0 * S
 
 
 SOUND = "no loss or fault was found"
-DRIVEN = [odom(BEGIN + t * S) for t in range(50)]
+DRIVEN = along_x(BEGIN, 50)
 
 
 def remembering(
@@ -52,9 +54,8 @@ def remembering(
     *,
     seconds: float = 60,
 ) -> Memory:
-    write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
     clock = SettableClock(BEGIN + round(seconds * S))
-    return memory_of(folder, clock=clock)
+    return remembered(folder, in_order(messages), clock=clock)
 
 
 def shown(memory: Memory) -> dict[str, Any]:
@@ -64,7 +65,7 @@ def shown(memory: Memory) -> dict[str, Any]:
 
 def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> None:
     """The robot died at 10 s, and the recorder logs each split that it opens."""
-    driven = [odom(BEGIN + t * S) for t in range(11)]
+    driven = along_x(BEGIN, 11)
     splits = [log_entry(BEGIN + t * S, 20, "rosbag2_recorder", "opened") for t in range(0, 60, 10)]
     memory = remembering(tmp_path, [*driven, *splits])
     assert shown(memory)["newest_age_s"] == 10.0  # of whoever recorded this
@@ -182,7 +183,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
 
 def test_an_action_that_nobody_calls_is_not_silent(tmp_path: Path) -> None:
     """Its topics have messages while a goal is active, as a log while there is something to log."""
-    messages = [odom(BEGIN + t * S) for t in range(600)]
+    messages = along_x(BEGIN, 600)
     called = [t for t in range(600) if t < 200 or 300 <= t < 350]
     messages += [goals(BEGIN + t * S + 1, {1: 2}) for t in called]
     messages += [boolean(BEGIN + t * S + 2, True, topic="/drive/_action/feedback") for t in called]
@@ -191,8 +192,7 @@ def test_an_action_that_nobody_calls_is_not_silent(tmp_path: Path) -> None:
     tree = "nav2_msgs/msg/BehaviorTreeLog"
     ticked = make(tree, timestamp=stamp(BEGIN), event_log=[])
     messages += [Msg("/behavior_tree_log", tree, BEGIN + t * S + 5, ticked) for t in called]
-    messages.sort(key=lambda message: message.log_time)
-    memory = remembered(tmp_path, messages)
+    memory = remembered(tmp_path, in_order(messages))
     status = asked(memory, "memory_status")
     assert [row["topic"] for row in status["fell_silent"]] == ["/bumper"]
     assert {row["topic"] for row in status["silences"]} == {"/bumper"}
@@ -207,7 +207,7 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     bumps = [boolean(BEGIN + t * S, True) for t in range(80)]
     write_mcap(tmp_path / "a" / "a_0.mcap", bumps)
     again = bumps[-1].log_time + LONGEST_OFF_NS + later
-    poses = [odom(again + t * S) for t in range(80)]
+    poses = along_x(again, 80)
     write_mcap(tmp_path / "b" / "b_0.mcap", poses)
     answer = memory_status(memory_of(tmp_path), Call())
     assert [each.topic for each in answer.fell_silent] == fell
@@ -218,7 +218,7 @@ def test_a_topic_that_was_taken_from_the_list_is_not_silent(
     tmp_path: Path, is_listed: bool
 ) -> None:
     bumps = [boolean(BEGIN + t * S, True) for t in range(80)]
-    drive = [odom(BEGIN + t * S) for t in range(400)]
+    drive = along_x(BEGIN, 400)
     write_splits(tmp_path, [*bumps, *drive], 100)
     listed = ("/odom", "/bumper") if is_listed else ("/odom",)
     beat(tmp_path, BEGIN + 400 * S, listed=listed, recordings=("rec",))
@@ -246,18 +246,10 @@ def test_a_topic_that_is_recorded_was_heard_though_its_recorder_hears_it_no_more
     assert shown(memory)["never_heard"] == ["/scan"]
 
 
-def test_what_stays_of_deleted_bags_shows_no_rate(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(BEGIN + t * S, True) for t in range(60)])
-    path = [odom(BEGIN - (100 - t) * 2 * S) for t in range(50)]
-    write_mcap(tmp_path / "memory" / "20260713.thinned.mcap", path)
-    memory = memory_of(tmp_path)
-    snapshot, latching = memory.index.snapshot(), memory.limits.latching
-    rates = {topic: usual_rate(snapshot, topic, latching) for topic in ("/bumper", "/odom")}
-    assert rates == {"/bumper": 1.0, "/odom": None}
-
-
-def test_what_stays_of_deleted_bags_does_not_slow_the_growth_of_the_others(tmp_path: Path) -> None:
-    write_splits(tmp_path, [odom(BEGIN + t * S) for t in range(60)])
+def test_what_stays_of_deleted_bags_has_no_rate_and_does_not_slow_the_growth_of_the_others(
+    tmp_path: Path,
+) -> None:
+    write_splits(tmp_path, along_x(BEGIN, 60))
     beat(tmp_path, BEGIN + 60 * S)
     limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
 
@@ -266,16 +258,20 @@ def test_what_stays_of_deleted_bags_does_not_slow_the_growth_of_the_others(tmp_p
         return float(shown(memory)["budget"]["growth_gb_per_day"])
 
     without_memory = growth()
-    day = [odom(BEGIN - hour * 3600 * S) for hour in range(26, 2, -1)]
+    day = [boolean(BEGIN - hour * 3600 * S, True) for hour in range(26, 2, -1)]
     write_mcap(tmp_path / "memory" / "20260713.thinned.mcap", day)
     assert growth() == without_memory
+    memory = memory_of(tmp_path)
+    snapshot, latching = memory.index.snapshot(), memory.limits.latching
+    rates = {topic: usual_rate(snapshot, topic, latching) for topic in ("/odom", "/bumper")}
+    assert rates == {"/odom": 1.0, "/bumper": None}
 
 
 @each_way
 def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     tmp_path: Path, recalls: bool
 ) -> None:
-    driven = [odom(BEGIN + t * S // 10, t / 20) for t in range(100)]
+    driven = along_x(BEGIN, 10, mps=0.5, hz=10)
     bag = write_mcap(tmp_path / "rec" / "rec_0.mcap", driven, McapLayout(chunk_size=3000))
     spoil_chunk(bag, 3)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S), recalls=recalls)
@@ -305,7 +301,7 @@ def recording(folder: Path, *listed: tuple[str, int]) -> None:
 
 
 def test_a_file_without_an_end_may_be_being_written_or_left_by_a_crash(tmp_path: Path) -> None:
-    messages = [odom(BEGIN + t * S) for t in range(9)]
+    messages = along_x(BEGIN, 9)
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     content = path.read_bytes()[:-100]
     path.write_bytes(content)
@@ -375,7 +371,7 @@ def test_nothing_behind_a_link_is_looked_at(tmp_path: Path) -> None:
 
 @each_way
 def test_a_recap_has_a_silence_as_an_event(tmp_path: Path, recalls: bool) -> None:
-    messages = [odom(BEGIN + at * S // 2) for at in range(600)]
+    messages = along_x(BEGIN, 300, hz=2)
     messages.append(boolean((T0 + 251) * S, data=True))
     seen = (at for at in range(300) if not 100 <= at < 190)
     messages += [detections((T0 + at) * S + 1, ["cup"] if at < 50 else []) for at in seen]
@@ -418,7 +414,7 @@ def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
     What is left of a silence beside it may be too short to be one.
     """
     silent = {"/early": [(60, 160), (320, 420)], "/late": [(80, 170), (330, 430)]}
-    messages = [odom((T0 + at) * S) for at in range(600)]
+    messages = along_x(T0 * S, 600)
     for nth, (topic, spans) in enumerate(silent.items()):
         heard = (at for at in range(600) if not any(start <= at < end for start, end in spans))
         messages += [boolean((T0 + at) * S + nth, data=True, topic=topic) for at in heard]
