@@ -20,7 +20,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
-from tests.support.bags import Msg, boolean, odom, tf, transform, write_splits
+from tests.support.bags import Msg, boolean, in_order, odom, tf, transform, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 
@@ -261,7 +261,7 @@ def test_of_a_frame_that_is_seen_now_and_then_the_nearest_time_is_named(
     messages = moving(T0, 600, "odom", "base_link", 0.0, 0.1)
     for begin in (100, 400):
         messages += moving(T0 + begin * S, 20, "odom", "tag", 5.0, 0.0)
-    record(tmp_path / "one", sorted(messages, key=lambda message: message.log_time))
+    record(tmp_path / "one", in_order(messages))
     memory = memory_of(tmp_path, recalls=recalls)
     for second, away, nearest in ((200, "80 s earlier", 120.0), (350, "50 s later", 400.1)):
         refused = looked_up(memory, T0 + second * S, "base_link", "tag")
@@ -278,7 +278,7 @@ def test_a_frame_that_two_nodes_place_in_two_parents_is_named(tmp_path: Path) ->
     messages = moving(T0, 20, "odom", "base_link", 0.0, 0.1)
     for at in range(T0, T0 + 20 * S, S // 2):
         messages.append(tf(at + 1000, transform(at + 1000, "map", "base_link", (1.0, 0.0, 0.0))))
-    record(tmp_path / "one", sorted(messages, key=lambda message: message.log_time))
+    record(tmp_path / "one", in_order(messages))
     memory = memory_of(tmp_path)
     for child in ("odom", "base_link"):
         refused = looked_up(memory, T0 + 10 * S + S // 5, "map", child)
@@ -287,28 +287,22 @@ def test_a_frame_that_two_nodes_place_in_two_parents_is_named(tmp_path: Path) ->
         assert said in refused["detail"]
 
 
-def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
-    """Neither listed, nor a reason to advise another time."""
-    nameless = moving(T0, 20, "", "base_link", 0.0, 0.0)
-    record(tmp_path / "one", [*nameless, *moving(T0, 20, "odom", "wheel", 0.0, 0.0)])
-    memory = memory_of(tmp_path)
-    found = frames(memory, Call())
-    assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
-    assert [note for note in found.notes if "no name" in note and note.endswith("1")]
-    refused = looked_up(memory, T0 + 300 * S, "", "base_link")
-    assert "ask about" not in refused["detail"]
-
-
 @each_way
-def test_a_frame_that_no_rotation_places_is_none(tmp_path: Path, recalls: bool) -> None:
-    """As tf2 refuses a quaternion that nobody filled in."""
+def test_a_frame_without_a_name_or_a_rotation_is_none(tmp_path: Path, recalls: bool) -> None:
+    """Nor advised for another time; tf2 refuses a quaternion that nobody filled in, too."""
     unfilled: Any = transform(T0, "base_link", "laser", (1.0, 0.0, 0.0))
     unfilled.transform.rotation.w = 0.0
     static = tf(T0, unfilled, topic="/tf_static")
-    record(tmp_path / "one", [static, *moving(T0, 20, "odom", "base_link", 0.0, 0.0)])
+    nameless = moving(T0, 20, "", "arm", 0.0, 0.0)
+    placed = moving(T0, 20, "odom", "base_link", 0.0, 0.0)
+    record(tmp_path / "one", [static, *nameless, *placed])
     memory = memory_of(tmp_path, recalls=recalls)
-    assert asked(memory, "list_frames")["frames"] == ["base_link", "odom"]
-    assert "ask about" not in looked_up(memory, T0 + 5 * S, "base_link", "laser")["detail"]
+    listed = asked(memory, "list_frames")
+    assert listed["frames"] == ["base_link", "odom"]
+    assert [note for note in listed["notes"] if "no name" in note and note.endswith("1")]
+    for second, parent, child in ((5, "base_link", "laser"), (300, "", "arm")):
+        refused = looked_up(memory, T0 + second * S, parent, child)
+        assert "ask about" not in refused["detail"]
 
 
 @settings(max_examples=examples(30))

@@ -15,6 +15,7 @@ from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
+    in_order,
     log_entry,
     odom,
     text,
@@ -145,8 +146,7 @@ def record_splits(
         first = T0 + (start + 10 * number) * S
         own = [message for message in latched if first <= message.log_time < first + 10 * S]
         driven = [odom(first + n * S, 1.0, 2.0) for n in range(10)]
-        messages = sorted([*driven, *own], key=lambda message: message.log_time)
-        write_mcap(bag_dir / name / f"{name}_{number}.mcap", messages, LAYOUT)
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", in_order([*driven, *own]), LAYOUT)
     (bag_dir / name / "handover.json").write_text('{"format": 1}')
 
 
@@ -244,8 +244,7 @@ def test_a_refusal_says_how_to_ask_what_a_rare_text_said_last(
     for begin in (0, 2000):
         states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said.items()]
         moving = [odom(T0 + (begin + at) * S, at) for at in range(1200)]
-        messages = sorted([*states, *moving], key=lambda message: message.log_time)
-        write_mcap(tmp_path / f"run{begin}" / "run_0.mcap", messages)
+        write_mcap(tmp_path / f"run{begin}" / "run_0.mcap", in_order([*states, *moving]))
     asking = memory_of(tmp_path, recalls=recalls)
 
     refused = at(asking, "/mission", T0 + 900 * S)

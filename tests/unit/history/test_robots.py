@@ -16,7 +16,17 @@ from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.insights.status import memory_status
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    along_x,
+    odom,
+    text,
+    tf,
+    transform,
+    write_db3,
+    write_mcap,
+)
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -66,7 +76,7 @@ def test_what_is_remembered_of_comparisons_is_bounded(
         reply = asked(memory, "get_topic_in_range", topic="/odom", max_samples=2, **window)
         assert MIXED.search(str(reply["notes"]))
     differing = memory.snapshot().timeline.memo.of(robots._DIFFERING, dict)
-    assert len(differing) <= 4
+    assert 0 < len(differing) <= 4
 
 
 @pytest.fixture(scope="module", params=["{0}/{0}_0", "{0}", "{0}_0"])
@@ -292,7 +302,7 @@ def test_what_two_recorders_of_one_robot_lost_at_other_moments_makes_no_second_r
     tmp_path: Path,
 ) -> None:
     """In the second from 25 on, neither has what the other one received."""
-    poses = [odom(T0 + n * S // 50, n / 100) for n in range(3000)]
+    poses = along_x(T0, 60, mps=0.5, hz=50)
     record(tmp_path, "a", poses[:1250] + poses[1275:])
     record(tmp_path, "b", poses[:1275] + poses[1300:])
     memory = memory_of(tmp_path)
@@ -332,22 +342,16 @@ def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> No
     assert "as after a clock was set back" in str(path["notes"])
 
 
-def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
-    record(tmp_path, "red", [mounted("base_link")])
-    later = T0 + 3600 * S
-    record(tmp_path, "blue", [mounted("torso", later)])
-    memory = memory_of(tmp_path)
-    (note,) = warned(memory)
-    assert "laser is in base_link in the recording red, and in torso in blue" in note
-
-
-def test_a_recording_that_is_replaced_or_grows_is_compared_again(tmp_path: Path) -> None:
+def test_a_frame_with_two_parents_is_two_robots_until_a_recording_is_replaced_or_grows(
+    tmp_path: Path,
+) -> None:
     later = T0 + 3600 * S
     clock = SettableClock(later + 600 * S)
     record(tmp_path, "red", [mounted("base_link")])
     record(tmp_path, "blue", [mounted("torso", later)])
     memory = memory_of(tmp_path, clock=clock)
-    assert len(warned(memory)) == 1
+    (note,) = warned(memory)
+    assert "laser is in base_link in the recording red, and in torso in blue" in note
     (tmp_path / "blue" / "blue_0.mcap").unlink()
     record(tmp_path, "blue", [mounted("base_link", later)])
     clock.at += 300 * S
@@ -362,7 +366,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
     tmp_path: Path, kind: str
 ) -> None:
     """100 s at 0.5 m/s; after 50 s the clock is set back by 30 s."""
-    poses = [odom(T0 + n * S // 10, n / 20) for n in range(1000)]
+    poses = along_x(T0, 100, mps=0.5, hz=10)
     logged = [
         replace(pose, log_time=pose.log_time - 30 * S * (n >= 500)) for n, pose in enumerate(poses)
     ]
