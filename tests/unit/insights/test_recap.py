@@ -440,7 +440,7 @@ def test_what_a_latched_topic_said_as_the_recorder_began_did_not_change_then(
         beats = [odom(at(start + nth)) for nth in range(60)]
         docked = [boolean(at(t), value, "/docked") for t, value in said.items()]
         path = tmp_path / f"rec{start}" / f"rec{start}_0.mcap"
-        write_mcap(path, sorted([*beats, *docked], key=attrgetter("log_time")), layout)
+        write_mcap(path, in_order([*beats, *docked]), layout)
     memory = memory_of(tmp_path, recalls=recalls)
     for start in (0, 600):
         events = asked(memory, "recap", start=T0 + start, end=T0 + 659)["events"]
