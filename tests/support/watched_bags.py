@@ -161,9 +161,9 @@ class WatchedBags:
     def logged(self, event: str) -> list[MutableMapping[str, Any]]:
         return [each for each in self.log if each["event"] == event]
 
-    def fired_at(self) -> list[int]:
-        """When rules fired, in order."""
-        return sorted(each["at_ns"] for each in self.logged("trigger_fired"))
+    def fired_at(self) -> list[float]:
+        """When rules fired, in order, in seconds since `T0`."""
+        return sorted((each["at_ns"] - T0) / S for each in self.logged("trigger_fired"))
 
     def close_all(self, at: int | None = None) -> None:
         """Ends what is being written, and has it looked at."""

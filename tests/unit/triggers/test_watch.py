@@ -87,7 +87,7 @@ def test_adopted_bags_fire_nothing_and_the_recording_beside_them_does(robot: Wat
     robot.look()
     robot.split(seconds(10, 20, {15}))
     robot.close_all()
-    assert robot.fired_at() == [T0 + 15 * S]
+    assert robot.fired_at() == [15]
 
 
 def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
@@ -127,7 +127,7 @@ def test_a_handover_that_was_given_up_ends_no_match(tmp_path: Path) -> None:
         robot.split(seconds(at, at + 30, range(at, at + 30)), old)
         robot.look()
     robot.close_all()
-    assert robot.fired_at() == [T0 + 30 * S]
+    assert robot.fired_at() == [30]
 
 
 def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silence(
@@ -144,7 +144,7 @@ def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silen
     robot.look()
     robot.split([text(T0 + n * S, "x") for n in range(80, 90)])
     robot.close_all()
-    assert robot.fired_at() == [T0 + 74 * S]
+    assert robot.fired_at() == [74]
     assert robot.spans() == [(64, 77)]
 
 
@@ -301,7 +301,7 @@ def test_what_happens_after_the_clock_was_set_back_fires_once(
     held = [*range(begin + 15, begin + 25), 131]
     robot.drive(140, held, first=begin + 10)
     robot.close_all()
-    assert [(at - T0) // S for at in robot.fired_at()] == sorted([98, begin + 15, 131])
+    assert robot.fired_at() == sorted([98, begin + 15, 131])
 
 
 def test_what_version_0_1_0_searched_after_the_clock_was_set_back_is_not_searched_again(
@@ -316,7 +316,7 @@ def test_what_version_0_1_0_searched_after_the_clock_was_set_back_is_not_searche
     robot.house = robot.new_house()
     robot.split(seconds(25, 35, {28}))
     robot.close_all()
-    assert robot.fired_at() == [T0 + 28 * S]
+    assert robot.fired_at() == [28]
 
 
 def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
@@ -332,7 +332,7 @@ def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
             robot.look(begin + 10)
         assert bad.name in (robot.problem() or "")
     robot.close_all(300)
-    assert [(at - T0) // S for at in robot.fired_at()] == [15, 22, 32, 42]
+    assert robot.fired_at() == [15, 22, 32, 42]
 
 
 @pytest.mark.parametrize("is_restarted", [False, True])
@@ -386,10 +386,10 @@ def test_a_first_split_that_is_readable_late_is_searched_then(
         robot.split(seconds(10, 20, {12}))
         robot.split(seconds(20, 30))
         robot.look(30)
-        assert robot.fired_at() == [T0 + 12 * S]
+        assert robot.fired_at() == [12]
         assert first.name in (robot.problem() or "")
     robot.close_all(300)
-    assert [(at - T0) // S for at in robot.fired_at()] == [5, 12]
+    assert robot.fired_at() == [5, 12]
     assert robot.problem() is None
 
 
@@ -399,7 +399,7 @@ def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> N
     paths[1].unlink()
     robot.split(seconds(50, 60))
     robot.close_all()
-    assert robot.fired_at() == [T0 + 25 * S]
+    assert robot.fired_at() == [25]
 
 
 def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
