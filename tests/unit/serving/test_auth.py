@@ -77,7 +77,7 @@ async def test_who_shows_the_token_comes_in(scheme: str) -> None:
     ],
 )
 @pytest.mark.parametrize("path", ["/mcp", "/health"])
-async def test_who_shows_another_is_told_that_it_is_wrong(path: str, header: str) -> None:
+async def test_another_token_is_told_to_be_wrong(path: str, header: str) -> None:
     inside = Inside()
     response = await asked(inside, path, authorization=header)
     assert response.status_code == 401
@@ -135,7 +135,7 @@ async def test_a_token_for_some_robots_opens_the_paths_of_questions_alone(
 
 
 @given(st.binary(max_size=80))
-async def test_no_other_bytes_open_it(shown: bytes) -> None:
+async def test_no_other_bytes_open_the_gate(shown: bytes) -> None:
     inside = Inside()
     sent: list[Any] = []
 
@@ -219,20 +219,22 @@ def revealed(env: dict[str, str]) -> str | None:
 
 
 @pytest.mark.parametrize("ending", ["", "\n", "\r\n"])
-def test_it_comes_from_a_file_whose_last_line_may_end(tmp_path: Path, ending: str) -> None:
+def test_a_token_comes_from_a_file_whose_last_line_may_end(tmp_path: Path, ending: str) -> None:
     file = tmp_path / "token"
     file.write_bytes((GOOD + ending).encode())
     assert revealed({"MEMORY_API_TOKEN_FILE": str(file)}) == GOOD
 
 
-def test_two_that_give_it_are_refused_by_name(tmp_path: Path) -> None:
+def test_two_sources_of_a_token_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "memory_api_token").write_text(GOOD)
     reply = refused({"MEMORY_API_TOKEN": GOOD, "CREDENTIALS_DIRECTORY": str(tmp_path)})
     assert "MEMORY_API_TOKEN and the credential memory_api_token" in reply
 
 
 @pytest.mark.parametrize("text", UNUSABLE.values(), ids=UNUSABLE)
-def test_one_that_cannot_be_used_is_refused_without_being_shown(tmp_path: Path, text: str) -> None:
+def test_a_token_that_cannot_be_used_is_refused_without_being_shown(
+    tmp_path: Path, text: str
+) -> None:
     reply = refused({"MEMORY_API_TOKEN": text})
     assert reply.startswith("MEMORY_API_TOKEN: the API token")
     assert "openssl rand -hex 32" in reply
@@ -243,7 +245,7 @@ def test_one_that_cannot_be_used_is_refused_without_being_shown(tmp_path: Path, 
     )
 
 
-def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+def test_a_token_in_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(pipe)})
@@ -253,7 +255,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     assert "none" in reply
 
 
-def test_a_server_on_the_loopback_address_may_have_one_which_what_it_starts_has_not() -> None:
+def test_a_server_on_the_loopback_address_may_have_a_token_which_what_it_starts_has_not() -> None:
     for none in ({}, {"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}):
         assert take_tokens(none, {}, resolve("127.0.0.1", 0)) == {}
     env = {"MEMORY_API_TOKEN": GOOD, "PATH": "/bin"}
@@ -266,7 +268,7 @@ def taken(env: dict[str, str], files: dict[Path, list[str]]) -> Tokens:
     return take_tokens(env, files, resolve("10.0.0.1", 0))
 
 
-def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) -> None:
+def test_a_limited_token_that_is_also_for_everything_is_refused(tmp_path: Path) -> None:
     """Whoever shows it would be answered about all robots."""
     site, other = tmp_path / "site", tmp_path / "other"
     site.write_text(f"{GOOD}\n")
@@ -279,7 +281,7 @@ def test_a_limited_one_that_is_also_for_everything_is_refused(tmp_path: Path) ->
     assert taken({}, {site: ["r1"]}) == limited
 
 
-def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path: Path) -> None:
+def test_a_token_in_a_file_of_the_configuration_is_refused_and_not_repeated(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("server:\n  api_token: sEcReT7sEcReT7sEcReT7\n")
     with pytest.raises(ConfigError) as caught:
         load_settings((), {"MEMORY_CONFIG_DIR": str(tmp_path)})
@@ -303,7 +305,7 @@ def test_in_a_file_of_the_configuration_it_is_refused_and_not_repeated(tmp_path:
         ("2001:db8::1", False),
     ],
 )
-def test_whether_others_can_reach_it_is_judged_by_the_address(host: str, loopback: bool) -> None:
+def test_is_loopback_is_judged_by_the_address_of_a_host(host: str, loopback: bool) -> None:
     assert resolve(host, 9203).is_loopback is loopback
 
 
@@ -313,7 +315,7 @@ def test_a_host_without_an_address_is_told_with_what_to_do(host: str) -> None:
         resolve(host, 9203)
 
 
-def test_what_is_judged_is_what_is_listened_on() -> None:
+def test_listen_takes_the_address_that_was_judged() -> None:
     address = resolve("localhost", 0)
     with listen(address) as listening:
         assert listening.getsockname()[0] == address.ip
