@@ -105,11 +105,19 @@ def arm(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:
 
 
 @pytest.mark.parametrize(
-    ("made", "count"),
-    [(joint_state, 15), *((arm, n) for n in (3, MAX_NUMBERS, MAX_NUMBERS + 1))],
+    ("made", "count", "field"),
+    [
+        # By the name of its array in the message, too.
+        (joint_state, 15, "position.elbow"),
+        (joint_state, 15, "positions.elbow"),
+        *((arm, n, "positions.elbow") for n in (3, MAX_NUMBERS, MAX_NUMBERS + 1)),
+    ],
 )
 def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
-    tmp_path: Path, made: Callable[[int, Sequence[str], Sequence[float]], Msg], count: int
+    tmp_path: Path,
+    made: Callable[[int, Sequence[str], Sequence[float]], Msg],
+    count: int,
+    field: str,
 ) -> None:
     kind, random = f"acme_msgs/msg/Arm{count}", Random(count)
     bent, stated = list[float](), list[float]()
@@ -127,7 +135,7 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
     plain = remembered(tmp_path, messages)
     states = [is_bent for is_bent, _ in groupby(angle > 0.5 for angle in stated)]
     window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
-    elbow = {"condition_type": "above", "value": 0.5, "field": "positions.elbow"}
+    elbow = {"condition_type": "above", "value": 0.5, "field": field}
     left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
     for memory in (plain, with_store(plain, tmp_path)):
         ask = partial(asked, memory, topic="/joints")
@@ -135,13 +143,13 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
         runs = ask(name="find_matches", **elbow, limit=100)["sightings"]
         assert sum(run["count"] for run in runs) == len(bent)
         assert len(runs) == states.count(True)
-        of_elbow = partial(ask, name="get_topic_in_range", fields=["positions.elbow"], **window)
+        of_elbow = partial(ask, name="get_topic_in_range", fields=[field], **window)
         shown = [angle for _, angle in of_elbow(max_samples=40)["rows"]]
         assert shown == pytest.approx(stated, abs=1e-6)
         of_hour = of_elbow(by="hour")
         ends = dict(zip(of_hour["columns"][1:], of_hour["all"], strict=True))
-        assert ends["positions.elbow.min"] == pytest.approx(min(stated), abs=1e-6)
-        assert ends["positions.elbow.max"] == pytest.approx(max(stated), abs=1e-6)
+        assert ends[f"{field}.min"] == pytest.approx(min(stated), abs=1e-6)
+        assert ends[f"{field}.max"] == pytest.approx(max(stated), abs=1e-6)
         assert ask(name="find_last_match", **left) is None
         refused = ask(name="find_last_match", **{**elbow, "field": "positions.knee"})
         assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")
@@ -230,18 +238,6 @@ def test_samples_of_a_joint_are_messages_that_name_it(tmp_path: Path) -> None:
         none = lift(start=begin + 41, end=begin + 45)
         assert (none["error"], none["reason"]) == ("no_data", "between_messages")
         assert none["detail"].endswith("in this time say nothing of positions.lift")
-
-
-def test_a_joint_is_found_by_the_name_of_its_array_in_the_message(tmp_path: Path) -> None:
-    messages = [joint_state(nth, ["elbow", "wrist"], [nth / 10, 9.0]) for nth in range(5)]
-    plain = remembered(tmp_path, messages)
-    given = {"topic": "/joints", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
-    for memory in (plain, with_store(plain, tmp_path)):
-        reply = asked(memory, "get_topic_in_range", fields=["position.elbow"], **given)
-        assert [angle for _, angle in reply["rows"]] == [0, 0.1, 0.2, 0.3, 0.4]
-        assert reply["extremes"]["position.elbow"]["max"] == 0.4
-        by_hour = asked(memory, "get_topic_in_range", fields=["position.elbow"], by="hour", **given)
-        assert by_hour["all"][by_hour["columns"].index("position.elbow.max") - 1] == 0.4
 
 
 def test_joints_of_a_robot_with_many_are_compared_without_reading_each_message(
