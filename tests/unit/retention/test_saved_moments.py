@@ -48,6 +48,8 @@ from tests.support.memories import memory_of
 from tests.support.simulated_recorders import events
 
 # A file has one size.
+OPEN = McapLayout(chunk_size=400, finish=False)
+"""Of a split that is being written."""
 FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_size=12)
 
 
@@ -133,18 +135,23 @@ def waiting(bag_dir: Path, **limits: Any) -> tuple[Housekeeping, SettableClock]:
     return house, clock
 
 
-def test_a_moment_waits_for_the_split_that_is_being_written(tmp_path: Path) -> None:
-    recording(tmp_path, A, 0, splits=2)
-    layout = McapLayout(chunk_size=400, finish=False)
-    open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+def waiting_for_open(bag_dir: Path) -> tuple[Housekeeping, SettableClock]:
+    """Two splits, a third that is being written, and a moment that waits for that one."""
+    recording(bag_dir, A, 0, splits=2)
+    open_one = bag(bag_dir / A / f"{A}_2.mcap", 20, OPEN)
     now = SettableClock(open_one.stat().st_mtime_ns)
-    recording_now(tmp_path, A, clock=now)
-    house = house_of(tmp_path, clock=now)
-    outcome = kept(house, tmp_path, 15, 25, at=now.at)
+    recording_now(bag_dir, A, clock=now)
+    house = house_of(bag_dir, clock=now)
+    outcome = kept(house, bag_dir, 15, 25, at=now.at)
     assert (outcome.bags, outcome.pending) == (1, True)
-    assert told_of(tmp_path)["complete"] is False
-    bag(open_one, 20)
-    bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
+    assert told_of(bag_dir)["complete"] is False
+    return house, now
+
+
+def test_a_moment_waits_for_the_split_that_is_being_written(tmp_path: Path) -> None:
+    _, now = waiting_for_open(tmp_path)
+    bag(tmp_path / A / f"{A}_2.mcap", 20)
+    bag(tmp_path / A / f"{A}_3.mcap", 30, OPEN)
     # Another recorder may be the one that goes on with it.
     house_of(tmp_path, clock=now).keep_moments()
     names = [name.rpartition("/")[2] for name in in_moments(tmp_path)]
@@ -152,12 +159,7 @@ def test_a_moment_waits_for_the_split_that_is_being_written(tmp_path: Path) -> N
 
 
 def test_a_split_that_is_still_open_when_a_moment_waits_no_longer_is_named(tmp_path: Path) -> None:
-    recording(tmp_path, A, 0, splits=2)
-    open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, McapLayout(chunk_size=400, finish=False))
-    now = SettableClock(open_one.stat().st_mtime_ns)
-    recording_now(tmp_path, A, clock=now)
-    house = house_of(tmp_path, clock=now)
-    assert kept(house, tmp_path, 15, 25, at=now.at).pending
+    house, now = waiting_for_open(tmp_path)
     now.at += 3 * 3600 * S  # as a robot without a clock of its own, when it finds a time server
     recording_now(tmp_path, A, clock=now)
     house.keep_moments()
@@ -205,10 +207,9 @@ def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_s
 def test_before_anything_is_deleted_a_pending_moment_goes_on(tmp_path: Path) -> None:
     """As after a night: the recorder that begins anew repairs and deletes before it records."""
     _, clock = waiting(tmp_path)
-    layout = McapLayout(chunk_size=400, finish=False)
-    bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+    bag(tmp_path / A / f"{A}_2.mcap", 20, OPEN)
     # In a moment nothing is repaired: it would be another file than that it was linked to.
-    left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
+    left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, OPEN)
     before = left.read_bytes()
     recording(tmp_path, B, 100, splits=2)
     clock.at = NOW
