@@ -25,8 +25,9 @@ from ros2_memory.history.view import (
     TimeRange,
     View,
     clamped,
-    open_search,
     open_span,
+    open_view,
+    search_window,
 )
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import (
@@ -144,7 +145,9 @@ def count_visits(
         raise InvalidArgumentsError(
             "by place counts the places of where, or all named ones: give where in place of x and y"
         )
-    view, _, window = open_search(memory, call, span)
+    wall = memory.clock.now()
+    window = search_window(span, wall)
+    view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
     topic = resolve_path_topic(view)
     mixed_spans = note_robots(view, topic, asked)
