@@ -21,6 +21,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Call, Memory, Note, Notes
@@ -189,6 +190,17 @@ class BagAccess:
         elif bag.state is BagState.ACTIVE:
             self.call.used_active = True
 
+    def track_thinned(self, first: Ns, last: Ns) -> None:
+        """Records for the reply if what was read between two log times is of a thinned day.
+
+        Where a saved moment has all messages, it is not.
+        """
+        read = TimeWindow(first, last + 1)
+        for part in map(read.intersect, self.call.asked or (read,)):
+            if not part.empty:
+                thinned_times = self.snapshot.timeline.thinned_times
+                self.call.used_thinned |= overlaps_any(thinned_times, part.start, part.stop - 1)
+
     def track_all_sources(self) -> None:
         """Records that the answer is about all bags, including bags that are being written."""
         if any(aside.until is not None for aside in self.snapshot.active):
@@ -263,7 +275,7 @@ class BagAccess:
         records = self.memory.reader.records(bag.path, topics, part, newest_first=newest_first)
         for count, record in enumerate(self._readable(bag, records, TimeWindow(since, MAX_NS)), 1):
             if is_thin:
-                self.call.note_thinned(record.log_time, record.log_time)
+                self.track_thinned(record.log_time, record.log_time)
             if count % _DEADLINE_CHECK_INTERVAL == 0:
                 self.check_deadline()
             yield StoredMessage(bag, record)

@@ -302,12 +302,6 @@ class Call:
         else:
             self.older = min(self.older, snapshot.older)
 
-    def note_thinned(self, first: Ns, last: Ns) -> None:
-        """Records that messages between two log times were read from a thinned day."""
-        self.used_thinned |= not self.asked or any(
-            window.overlaps(first, last) for window in self.asked
-        )
-
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row of the reply that ends then must be shown."""
         return self.rows_in is None or self.rows_in.contains(row_end)

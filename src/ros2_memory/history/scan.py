@@ -44,7 +44,7 @@ def scan(
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `open_scan` and `columns.scan.Scan.rows`."""
     for rows in open_scan(view, topic, window, **how).rows(newest_first=newest_first):
-        view.track_thinned(TimeWindow(rows.first, rows.last + 1))
+        view.bags.track_thinned(rows.first, rows.last)
         yield rows
 
 
@@ -135,7 +135,7 @@ def joined_back(
         beside: how far (ns) before and after a stretch its results depend on rows.
     """
     for stretch in opened.stretches(beside):
-        view.track_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
+        view.bags.track_thinned(stretch.window.start, stretch.last)
         key = key_of(stretch)
         if key is None:
             yield from make(stretch._replace(parts=None))

@@ -17,7 +17,6 @@ from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.spans import Spans, overlaps_any
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -48,6 +47,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.columns.scan import Scan
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.storage.base import IntArray
@@ -155,13 +155,6 @@ class View:
         firsts = concatenated(column.firsts for column in columns)
         return firsts, concatenated(column.lasts for column in columns)
 
-    def track_thinned(self, window: TimeWindow) -> None:
-        """Records for the reply if a window that was read lies partly in thinned days."""
-        for part in map(window.intersect, self.call.asked or (window,)):
-            if not part.empty:
-                thinned = overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1)
-                self.call.used_thinned |= thinned
-
     def gaps(
         self, window: TimeWindow, *, around: bool = False, steps: bool = False
     ) -> Sequence[Span]:
@@ -222,7 +215,7 @@ class View:
         """Returns the log time of the newest message of a type that is no copy."""
         for block in blocks(opened.rows(newest_first=True), newest_first=True):
             for rows in block:
-                self.track_thinned(TimeWindow(rows.first, rows.last + 1))
+                self.bags.track_thinned(rows.first, rows.last)
             spans = [rows.span for rows in block if rows.table.channel.type == type_name]
             if spans:
                 return max(last for _, last in spans)

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.columns import decode
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
@@ -34,7 +35,7 @@ from tests.support.bags import (
 )
 from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, reply_over, with_store
 from tests.support.noting_reader import NotingReader
 from tests.support.random_histories import S
 
@@ -246,3 +247,13 @@ def test_the_newest_message_of_a_silent_topic_is_read_without_the_time_after_it(
     assert newest is not None
     assert newest.time == T0 + 1
     assert max(window.stop for window in reader.windows) == T0 + 2
+
+
+def test_what_a_saved_moment_has_whole_is_not_said_to_be_of_a_thinned_day(tmp_path: Path) -> None:
+    day = [odom(T0 + n * S, float(n)) for n in range(600)]
+    write_mcap(tmp_path / "memory" / f"{utc_day(T0)}.thinned.mcap", day)
+    whole = [odom(T0 + 100 * S + n * S // 10, 100 + n / 10) for n in range(300)]
+    write_mcap(tmp_path / "moments" / "fall" / "rec" / "rec_0.mcap", whole)
+    for after_s, is_thinned in ((110, False), (300, True)):
+        reply = reply_over(tmp_path, "get_position_at", timestamp=T0 / S + after_s)
+        assert (reply["x"], "from" in reply) == (after_s, is_thinned)
