@@ -7,7 +7,7 @@ many bags, so the numbers of all summaries are read as arrays.
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import chain
+from itertools import chain, starmap
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -132,6 +132,13 @@ class Pace(NamedTuple):
             and length >= messages * RARE_NS
             and length - span >= 2 * RARE_NS
         )
+
+
+class TopicTimes(NamedTuple):
+    """How often bags hold a topic, and in which spans; see `analysis.silences`."""
+
+    pacing: Pacing
+    runs: tuple[Span, ...]
 
 
 class Tally(NamedTuple):
@@ -359,26 +366,15 @@ class Segment:
         return sorted({header.topic for header in self.headers})
 
     @cached_property
-    def pacings(self) -> dict[str, Pacing]:
-        """By topic, how often the bags hold it."""
-        pacings, _ = self._pacings_and_runs
-        return pacings
-
-    @cached_property
-    def runs(self) -> dict[str, tuple[Span, ...]]:
-        """By topic, when the bags hold it; see `analysis.silences`."""
-        _, runs = self._pacings_and_runs
-        return runs
-
-    @cached_property
-    def _pacings_and_runs(self) -> tuple[dict[str, Pacing], dict[str, tuple[Span, ...]]]:
+    def topic_times(self) -> dict[str, TopicTimes]:
+        """By topic, how often and when the bags hold it."""
         # Both at once: the numbers of all parts take too much memory to be kept.
         numbers, lengths = self._parts_between_absences()
         counts = numbers[:, :, 0]
         spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
         rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
-        pacings = {topic: Pacing(*row) for topic, row in zip(self._topics, rows, strict=True)}
-        return pacings, dict(zip(self._topics, _runs(numbers), strict=True))
+        topic_times = map(TopicTimes, starmap(Pacing, rows), _runs(numbers))
+        return dict(zip(self._topics, topic_times, strict=True))
 
     def _parts_between_absences(self) -> tuple[Ints, Ints]:
         """Cuts bags at the absences that their summaries state.

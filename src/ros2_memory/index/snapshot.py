@@ -146,8 +146,8 @@ class Snapshot:
         """The usual period of each topic that has one; logs and calls have none."""
         by_topic: dict[str, list[Pacing]] = {}
         for segment in self.whole_segments:
-            for topic, pacing in segment.pacings.items():
-                by_topic.setdefault(topic, []).append(pacing)
+            for topic, times in segment.topic_times.items():
+                by_topic.setdefault(topic, []).append(times.pacing)
         for topic in filter(self.timeline.is_on_events, [*by_topic]):
             del by_topic[topic]
         return usual_periods({topic: joined_pacings(parts) for topic, parts in by_topic.items()})
@@ -157,8 +157,8 @@ class Snapshot:
         """By topic, when bags hold it; see `silences`."""
         by_topic: dict[str, list[Span]] = {}
         for segment in self.whole_segments:
-            for topic, runs in segment.runs.items():
-                by_topic.setdefault(topic, []).extend(runs)
+            for topic, times in segment.topic_times.items():
+                by_topic.setdefault(topic, []).extend(times.runs)
         return {topic: united(runs, SHORTEST_NS) for topic, runs in by_topic.items()}
 
     @cached_property
@@ -209,17 +209,8 @@ class Snapshot:
 
         None without bags.
         """
-        begin = reach = None
-        for segment in self._dated_segments:
-            bags, start, end = segment.bags, segment.bags[0].start, segment.latest
-            spans = [(start, end)]
-            if end - start > LONGEST_OFF_NS:
-                spans = [*zip(bags.starts.tolist(), bags.ends.tolist(), strict=True)]
-            for start, end in spans:
-                if reach is None or start - reach > LONGEST_OFF_NS:
-                    begin = start
-                reach = end if reach is None else max(reach, end)
-        return begin
+        ends = [end for start, end in self.gaps if end - start > LONGEST_OFF_NS]
+        return max(ends, default=self.earliest)
 
     @cached_property
     def gaps(self) -> Sequence[Span]:
