@@ -125,11 +125,6 @@ class _ReadLog:
         # `map` goes on after an error of the reader, as the reader does; a generator would end.
         return map(self._logger(), records)
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns and logs what the reader returns."""
-        record = self._reader.newest(path, topic, window)
-        return None if record is None else self._logger()(record)
-
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
     ) -> Iterator[Batch]:

@@ -203,7 +203,8 @@ class _Kinds:
         for channel in channels if is_large else ():
             if self._plan(channel, self.reader.definition(channel))[0] is not None:
                 with suppress(BagError):
-                    newest = self.reader.newest(path, channel.topic, window)
+                    records = self.reader.records(path, [channel.topic], window, newest_first=True)
+                    newest = next(records, None)
                     if newest is not None and len(newest.payload) > BULKY_BYTES:
                         self._bulky.add(channel.topic)
 

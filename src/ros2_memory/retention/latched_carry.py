@@ -252,7 +252,9 @@ class Carrier:
             yield latched_message(record, self._frames(record)), Origin((folder,), often=False)
         for topic in frequent:
             try:
-                newest = self.reader.newest(bag.path, topic, TimeWindow.everything())
+                everything = TimeWindow.everything()
+                records = self.reader.records(bag.path, [topic], everything, newest_first=True)
+                newest = next(records, None)
             except BagError:
                 readable = self._records(bag.path, (topic,))
                 newest = max(readable, key=attrgetter("log_time"), default=None)

@@ -261,15 +261,6 @@ class BagReader(ABC):
                 `summarize` returned `complete=False`, the early end is known and raises nothing.
         """
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the first of `records(path, [topic], window, newest_first=True)`, or None.
-
-        Raises:
-            BagVanishedError: the file is not there.
-            BagError: it cannot be read.
-        """
-        return next(self.records(path, [topic], window, newest_first=True), None)
-
     @abstractmethod
     def batches(
         self,

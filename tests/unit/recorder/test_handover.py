@@ -146,7 +146,7 @@ def assert_union(bag_dir: Path) -> None:
         assert list(reader.records(path, TOPICS, everything, newest_first=True)) == forward[::-1]
         for topic in TOPICS:
             of_topic = [each for each in forward if each.channel.topic == topic]
-            newest = reader.newest(path, topic, everything)
+            newest = next(reader.records(path, [topic], everything, newest_first=True), None)
             assert newest == (of_topic[-1] if of_topic else None)
 
 

@@ -112,7 +112,7 @@ def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
         next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))
     # From now on it is known, and named in every answer.
     with pytest.raises(BagError):
-        reader.newest(path, "/chatter", EVERYTHING)
+        next(reader.records(path, ["/chatter"], EVERYTHING, newest_first=True), None)
     assert read_on(reader, path)[0] == [*range(count)]
     assert any("without its indexes" in note for note in reader.summarize(path).notes)
     reply = asked(memory_of(tmp_path), "get_topic_in_range", topic="/chatter", start=0, end=1)
