@@ -48,6 +48,7 @@ MAX_TEXT: Final = 2000
 """Characters of one string in a reply."""
 
 _METRIC_DECIMALS: Final = 4
+"""Of metres, m/s and rad/s."""
 _DEGREE_DECIMALS: Final = 2
 _SIGNIFICANT_DIGITS: Final = 11
 """Of a number of unknown unit: 1e-8 of a degree, also at a longitude of three digits."""
@@ -56,16 +57,6 @@ _LEAST_DECIMALS: Final = 6
 _REALS: Final = (int, float)  # as a tuple: a union is made anew with each call
 _LARGEST_WHOLE: Final = 10**15
 _LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
-
-
-def round_metric(number: float) -> JsonValue:
-    """Rounds metres, m/s and rad/s to 1e-4."""
-    return _whole_or_null(round(number, _METRIC_DECIMALS))
-
-
-def round_degrees(number: float) -> JsonValue:
-    """Rounds an angle in degrees to 1e-2."""
-    return _whole_or_null(round(number, _DEGREE_DECIMALS))
 
 
 def round_single(number: np.float32) -> JsonValue:
@@ -270,9 +261,9 @@ class ReplyJson(ExactJson):
         if isinstance(number, int):
             return round_integer(int(number))
         if isinstance(number, Metric):
-            return round_metric(number)
+            return _whole_or_null(round(number, _METRIC_DECIMALS))
         if isinstance(number, Degrees):
-            return round_degrees(number)
+            return _whole_or_null(round(number, _DEGREE_DECIMALS))
         return round_single(number) if isinstance(number, np.float32) else round_real(number)
 
     def _seconds(self, time: Ns, /) -> JsonValue:
