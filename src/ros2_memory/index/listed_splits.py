@@ -93,14 +93,9 @@ def listing_from_json(text: str) -> tuple[_Stamp, _FolderListing]:
     Raises:
         ValueError, TypeError, OverflowError: the text has another form.
     """
-    (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
-    return _Stamp(mtime, size, folder), _FolderListing(
-        tuple((str(name), int(count)) for name, count in first),
-        tuple((str(name), int(count)) for name, count in later),
-        None if bags is None else int(bags),
-        None if messages is None else int(messages),
-        bool(is_total),
-    )
+    stamp, (first, later, *others) = json.loads(text)
+    listing = _FolderListing(tuple(map(tuple, first)), tuple(map(tuple, later)), *others)
+    return _Stamp(*stamp), listing
 
 
 def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Absent]:
