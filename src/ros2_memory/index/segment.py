@@ -205,17 +205,19 @@ class Segment:
         return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
-    def folder_spans(self) -> dict[str, Span]:
-        """By folder, the log times of the first and last message (inclusive) in its bags."""
-        _, firsts, lasts = _sum_groups(self._by_folder, [0], axis=0)[0].T.tolist()
-        return dict(zip(self.bags.folders, zip(firsts, lasts, strict=True), strict=True))
+    def folder_totals(self) -> dict[str, TopicTotals]:
+        """By folder, the totals of all topics in its bags."""
+        return dict(zip(self.bags.folders, _joined(self._by_folder), strict=True))
 
-    @cached_property
+    @property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the number of its bags and of their messages."""
-        messages = self._by_folder[:, :, 0].sum(axis=0)
-        rows = zip(np.bincount(self.bags.folder_of).tolist(), messages.tolist(), strict=True)
-        return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
+        bags = np.bincount(self.bags.folder_of).tolist()
+        totals = self.folder_totals.items()
+        return {
+            folder: Tally(count, of_folder.messages)
+            for count, (folder, of_folder) in zip(bags, totals, strict=True)
+        }
 
     @cached_property
     def handed_over(self) -> frozenset[str]:
@@ -290,12 +292,8 @@ class Segment:
         headers = [nth for nth, header in enumerate(self.headers) if header.topic == topic]
         if not headers:
             return {}
-        [by_folder] = _sum_groups(self._by_folder[headers], [0], axis=0).tolist()
-        return {
-            path: TopicTotals(first, last, messages)
-            for path, (messages, first, last) in zip(self._recording_paths, by_folder, strict=True)
-            if messages
-        }
+        by_folder = zip(self._recording_paths, _joined(self._by_folder[headers]), strict=True)
+        return {path: totals for path, totals in by_folder if totals.messages}
 
     @cached_property
     def _by_folder(self) -> Ints:
@@ -484,6 +482,12 @@ def _sum_groups(numbers: Ints, begins: Sequence[int] | NDArray[np.intp], axis: i
         ],
         axis=2,
     )
+
+
+def _joined(by_folder: Ints) -> list[TopicTotals]:
+    """Returns the totals of all headers in each folder; see `Segment._by_folder`."""
+    [rows] = _sum_groups(by_folder, [0], axis=0).tolist()
+    return [TopicTotals(first, last, messages) for messages, first, last in rows]
 
 
 def _runs(numbers: Ints) -> Iterator[tuple[Span, ...]]:

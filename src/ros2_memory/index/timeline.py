@@ -270,7 +270,8 @@ class Timeline:
         for segment in self.segments:
             if folder in segment.bags.folders:
                 totals |= segment.recordings(topic).get(recording, NO_TOTALS)
-                spans.append(segment.folder_spans[folder])
+                of_folder = segment.folder_totals[folder]
+                spans.append((of_folder.first, of_folder.last))
         return Pace(totals, *enclosing(spans))
 
     @cached_property
