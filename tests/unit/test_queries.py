@@ -14,7 +14,7 @@ from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
-from tests.support.bags import command, detections, odom
+from tests.support.bags import command, detections, odom, text
 from tests.support.closed_form import TURN_RATE, position
 from tests.support.memories import ROOT, asked, memory_of, remembered
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -115,3 +115,12 @@ def test_a_robot_that_is_faster_than_is_taken_for_plausible_is_told_the_setting(
     reply = asked(memory, "trajectory_summary", start=T0 // S, end=T0 // S + 20)
     assert reply["distance_m"] == pytest.approx(99 * 2.8, rel=0.01)
     assert "plausible" not in str(reply.get("notes"))
+
+
+@pytest.mark.parametrize("step", ['{"step": "heat"}', "heat"], ids=["JSON", "text"])
+def test_a_key_of_a_text_of_json_is_said_to_be_no_field(tmp_path: Path, step: str) -> None:
+    memory = remembered(tmp_path, [text(1_784_000_000 * 10**9, step, "/task")])
+    window = {"topic": "/task", "start": 1_784_000_000, "end": 1_784_000_001}
+    reply = asked(memory, "get_topic_in_range", **window, fields=["step"])
+    hint = "data is a text of JSON: a condition may be on data.step"
+    assert (hint in reply["detail"]) == (step != "heat")

@@ -282,6 +282,13 @@ class Condition:
         counted = self.counted(value)
         return counted is value or self._passes(counted)
 
+    def is_on(self, label: str) -> bool:
+        """Returns whether the label of a detection, which may be a number, is what is sought."""
+        on_label = Condition(self.test)
+        if not isinstance(self.test, Contains | Equals):
+            return False
+        return on_label.matches(label) or (label.isdecimal() and on_label.matches(int(label)))
+
     def counted(self, value: JsonValue) -> JsonValue:
         """Returns the value without the detections whose score is too low to count."""
         return value if self.min_score <= 0 else without_low_scores(value, self.least_score)

@@ -259,11 +259,7 @@ def _label_held(
     view, field = binned.view, condition.field
     if field and not all(_is_label(view, topic, field, binned.counted) for topic in topics):
         return None
-    on_label = Condition(condition.test)
-
-    def matches(label: str) -> bool:
-        return on_label.matches(label) or (label.isdecimal() and on_label.matches(int(label)))
-
+    matches = condition.is_on
     if scope.is_bounded or condition.min_score or len(topics) > 1:
         seen = read_labels(view, topics, scope, condition, matches)
         visible, since = seen.visible, seen.since

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Equals, NearPosition, matched_texts
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
@@ -281,6 +281,7 @@ def _run_sightings(
     view.notes.retract_outside(searched)
     found = _found_in(view, search, runs, scope, selection.frame_id)
     sightings = _with_fields(view, found, selection.fields)
+    view.notes.add(*_flicker_notes(view, search, runs))
     return _SelectedRows(total, searched, sightings)
 
 
@@ -421,6 +422,27 @@ def _notes_on_texts(view: View, topics: Sequence[str]) -> Iterator[str]:
                 f"a text on {topic} counts for the moment in which it was said: changes, and by "
                 "value, of get_topic_in_range have for how long each held until the next one"
             )
+
+
+def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> Iterator[str]:
+    """Yields that most sightings of a label differ by a moment in which a detector missed it."""
+    in_time = sorted(runs, key=lambda run: (run.topic, run.first))
+    close = sum(
+        after.topic == before.topic and after.first - before.last <= FLICKER_NS
+        for before, after in pairwise(in_time)
+    )
+    if 2 * close < max(len(runs), 2):
+        return
+    newest = _newest_match(view, search, runs[0])
+    message = None if newest is None else view.bags.decode(newest)
+    if newest is None or message is None:
+        return
+    _, detections = _counted_content(view, search.condition, newest.type, message)
+    if any(map(search.condition.is_on, [detection.label for detection in detections])):
+        yield (
+            f"{close} of these sightings end because the detector missed it for less than 3 s: "
+            "with by they count as one with the next"
+        )
 
 
 def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:

@@ -77,6 +77,11 @@ _UNDECODED: Final = Reason(
 )
 
 
+_OF_MARKERS: Final = (
+    "; a detector of markers may send their places as transforms: list_frames, get_transform_at"
+)
+
+
 class ThingsQuestion(NamedTuple):
     """A question about things, and what it found.
 
@@ -541,8 +546,10 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
                 crowded,
             )
         if unplaced:
+            is_marker = any(label.name.isdecimal() for label in labels if label.unplaced)
             yield repeating(
-                f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}",
+                f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}"
+                f"{_OF_MARKERS if is_marker else ''}",
                 [label.name for label in labels],
             )
 
@@ -643,7 +650,9 @@ def _detection_notes(
     unplaced = in_window.unplaced
     if unplaced:
         lost = counted(unplaced, "detection")
-        yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
+        hint = _OF_MARKERS if in_window.name.isdecimal() else ""
+        are = "is" if unplaced == 1 else "are"
+        yield f"{lost} of it could not be placed, and {are} left out{hint}"
     if in_window.is_held:
         times = counted(in_window.carried, "time")
         last = int(in_window.spots[in_window.is_carried, Spot.LAST].max())

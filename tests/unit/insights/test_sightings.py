@@ -53,6 +53,25 @@ BEGIN = T0 * S
 OBJECTS = "/vision/scene/scene_objects"
 
 
+@each_way
+@pytest.mark.parametrize(("missed_s", "close"), [(1, 4), (4, 0)])
+def test_it_is_said_that_a_detector_missed_it_for_a_moment_only(
+    tmp_path: Path, recalls: bool, missed_s: int, close: int
+) -> None:
+    """Five sightings of 10 s."""
+    seen = [
+        detections(BEGIN + at * S, [] if at % 10 < missed_s else ["cup"]) for at in range(1, 50)
+    ]
+    memory = remembered(tmp_path, seen, recalls=recalls)
+    cup = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
+    found = asked(memory, "find_matches", **cup, limit=10)
+    notes = [note for note in found.get("notes", ()) if "missed it for less than 3 s" in note]
+    assert found["total"] == 5
+    assert [note.split()[0] for note in notes] == ([str(close)] if close else [])
+    counts = table(asked(memory, "find_matches", **cup, by="day"))["all"]
+    assert counts["count"] == 5 - close
+
+
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     seen, limits = [detections(BEGIN, ["cup"], score=0.2)], QuerySettings(min_score=0.5)
     memory = remembered(tmp_path, seen, limits=limits)

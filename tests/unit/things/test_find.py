@@ -815,6 +815,22 @@ def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path) -> None:
         assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
 
 
+@pytest.mark.parametrize("label", [None, "7"], ids=["all", "one"])
+def test_of_a_marker_without_a_place_it_is_said_that_transforms_may_have_it(
+    tmp_path: Path, label: str | None
+) -> None:
+    tag = make("apriltag_msgs/msg/AprilTagDetection", family="f", id=7, decision_margin=9.0)
+    name = "apriltag_msgs/msg/AprilTagDetectionArray"
+    messages = looked(0, 30, HERE, ("cup", 3.0, 0.0))
+    for at in range(BEGIN * S, (BEGIN + 30) * S, S):
+        found = make(name, header=header(at, "camera"), detections=[tag])
+        messages.append(Msg("/tags", name, at, found))
+    write_splits(tmp_path, messages)
+    given = {} if label is None else {"label": label}
+    assert "places as transforms: list_frames, get_transform_at" in str(ask(tmp_path, **given))
+    assert "as transforms" not in str(ask(tmp_path, label="cup"))
+
+
 def test_a_place_that_is_given_as_near_is_said_to_be_one(tmp_path: Path) -> None:
     write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.0)))
     assert '"Kitchen" is a place: ask with it as where' in ask(tmp_path, near="Kitchen")["notes"]
