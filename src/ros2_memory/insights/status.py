@@ -10,7 +10,7 @@ from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
-from ros2_memory.core.errors import BagError, RefusedError
+from ros2_memory.core.errors import BagError, NotInLakeError, RefusedError, UndecodableError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
@@ -402,13 +402,29 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
     bag = view.timeline.bag_with(topic, type_name)
-    stored = view.memory.scanner.channels(view.timeline, bag)
-    reasons = {*_reasons_of(view, stored, topic, type_name)}
+    channels: Sequence[Channel] = view.memory.scanner.channels(view.timeline, bag)
     # Other bags are stored, too, also deleted ones: if they differ in this, the bag itself is read.
-    if len(reasons) == 1:
-        return reasons.pop()
-    of_bag = _reasons_of(view, view.bags.channels(bag), topic, type_name)
-    return next(filter(None, reversed(of_bag)), None)
+    if len({*_reasons_of(view, channels, topic, type_name)}) != 1:
+        channels = view.bags.channels(bag)
+    reason = next(filter(None, reversed(_reasons_of(view, channels, topic, type_name))), None)
+    own = (channel for channel in channels if (channel.topic, channel.type) == (topic, type_name))
+    if reason is None and any(not channel.schema.text.strip() for channel in own):
+        return _why_first_undecodable(view, topic, type_name)
+    return reason
+
+
+def _why_first_undecodable(view: View, topic: str, type_name: str) -> str | None:
+    """Returns why the first message of a topic cannot be decoded; None if it can.
+
+    A type with an empty definition may have no fields, or was not found by the recorder: the
+    message shows which.
+    """
+    failures: list[UndecodableError] = []
+    with suppress(BagError, NotInLakeError):
+        first = view.stream.first([topic], TimeWindow.everything())
+        if first is not None and first.type == type_name:
+            view.bags.decode(first, failures)
+    return next((failure.reason for failure in failures), None)
 
 
 def _reasons_of(

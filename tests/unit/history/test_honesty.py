@@ -57,7 +57,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.heartbeats import beat
 from tests.support.listed_bags import odom_bag
-from tests.support.mcap_surgery import chunks_of, spoil_chunk
+from tests.support.mcap_surgery import chunks_of, raw_mcap, spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, remembered, replied, with_store
 from tests.unit.history.test_any_cut import questions
 
@@ -296,6 +296,27 @@ def test_what_cannot_be_decoded_is_judged_by_bags_that_are_there(
     assert asked(memory, "data_time_range")["undecodable"] == []
     (tmp_path / "run1" / "run1_0.mcap").unlink()
     assert asked(memory, "data_time_range")["undecodable"] == []
+
+
+@each_way
+@pytest.mark.parametrize(("fields", "is_lost"), [(b"later", True), (b"\x00", False)])
+def test_messages_of_a_type_that_the_recorder_did_not_find_are_said_to_be_undecodable(
+    tmp_path: Path, recalls: bool, fields: bytes, is_lost: bool
+) -> None:
+    """As the feedback of actions, whose definition rosbag2 does not find; or it has no fields."""
+    payload = b"\x00\x01\x00\x00" + fields
+
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema("a_msgs/action/Go_FeedbackMessage", "ros2msg", b"")
+        channel = writer.register_channel("/go/_action/feedback", "cdr", schema)
+        for at in range(20):
+            writer.add_message(channel, T0 + at * S, payload, T0 + at * S)
+
+    raw_mcap(tmp_path / "run" / "run_0.mcap", fill, profile="ros2")
+    memory = memory_of(tmp_path, recalls=recalls)
+    rows = asked(memory, "data_time_range")["undecodable"]
+    assert [row["topic"] for row in rows] == (["/go/_action/feedback"] if is_lost else [])
+    assert ("cannot be decoded" in asked(memory, "memory_status")["doubts"]) == is_lost
 
 
 @each_way

@@ -826,7 +826,7 @@ def test_of_a_marker_without_a_place_it_is_said_that_transforms_may_have_it(
         found = make(name, header=header(at, "camera"), detections=[tag])
         messages.append(Msg("/tags", name, at, found))
     write_splits(tmp_path, messages)
-    given = {} if label is None else {"label": label}
+    given: dict[str, Any] = {} if label is None else {"label": label}
     assert "places as transforms: list_frames, get_transform_at" in str(ask(tmp_path, **given))
     assert "as transforms" not in str(ask(tmp_path, label="cup"))
 
