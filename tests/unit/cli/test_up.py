@@ -132,14 +132,14 @@ def test_what_is_to_outlive_the_bags_is_asked_once(
 
 
 def test_install_hands_the_list_over_to_the_script_and_names_what_services_are_to_be_given(
-    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, became: list[list[str]]
+    exits: Program, tmp_path: Path, became: list[list[str]]
 ) -> None:
-    monkeypatch.setattr(sys, "stdin", Terminal("y\ny\n"))
     file = tmp_path / "bags" / "topics.yaml"
-    shown = exits(0, f"up retention.max_total_gb=50 --install --bag-dir {tmp_path}/bags").out
+    flags = f"--yes --install --bag-dir {tmp_path}/bags"
+    shown = exits(0, f"up retention.max_total_gb=50 {flags}").out
     script = str(ROOT / "deploy" / "install.sh")
     assert became[0][1:] == [f"PYTHON={sys.executable}", script, "--topics", str(file)]
     assert became[0][0] == ("sudo" if os.geteuid() else "env")
-    given = "retention.max_total_gb=50 recorder.setup_files=[] memory.keep=true"
+    given = "retention.max_total_gb=50 recorder.setup_files=[]"
     assert f"to be set in /etc/ros2-memory/environment: {given}\n" in shown
     assert load_topics(file).entries == ("/odom", "/tf", "/tf_static")

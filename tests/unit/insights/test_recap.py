@@ -373,7 +373,7 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
     """It may have been so for long: the robot was off for nine minutes."""
     for name, begin, is_worse in (("first", 0, False), ("second", 600, True)):
         level, charge, vx = (2, 0.09, 0.0) if is_worse else (0, 0.5, 0.4)
-        body = [odom(at(begin + t / 10)) for t in range(300)]
+        body = along_x(at(begin), 30, hz=10)
         for t in range(begin + 1, begin + 30):
             body += [battery(at(t), charge), diagnostics(at(t), lidar=(level, ""))]
             body += [boolean(at(t), is_worse), command(at(t), vx), goals(at(t), {1: 2})]
@@ -389,7 +389,7 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
 
 def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Path) -> None:
     """As after a restart, before the initial pose is known."""
-    stood = [odom(at(nth)) for nth in range(60)]
+    stood = along_x(BEGIN, 60)
     placed = [tf(at(nth), transform(at(nth), "map", "odom", (7, 2, 0))) for nth in range(40, 60)]
     write_mcap(tmp_path / "bag.mcap", in_order([*stood, *placed]))
     reply = asked(memory_of(tmp_path), "recap", start=at(0) / S, end=at(59) / S)
@@ -414,7 +414,7 @@ def test_the_state_of_an_action_is_that_of_the_goal_that_runs_or_ended_last(
 ) -> None:
     """A server lists its goals as it accepted them, for minutes after they ended."""
     statuses = [goals(at(second), each) for second, each in listed.items()]
-    memory = remembered(tmp_path, [*(odom(at(nth)) for nth in range(250)), *statuses])
+    memory = remembered(tmp_path, [*along_x(BEGIN, 250), *statuses])
     for moment in moments:
         assert before(memory, moment)["state"]["/drive goal"] == state
 
@@ -437,19 +437,14 @@ def test_what_a_latched_topic_said_as_the_recorder_began_did_not_change_then(
     """The recorder receives the newest value, however old it is."""
     layout = McapLayout(latched=frozenset({"/docked"}))
     for start, said in ((0, {0.5: True}), (600, {600.5: False, 630: True})):
-        beats = [odom(at(start + nth)) for nth in range(60)]
-        docked = [boolean(at(t), value, "/docked") for t, value in said.items()]
-        path = tmp_path / f"rec{start}" / f"rec{start}_0.mcap"
-        write_mcap(path, in_order([*beats, *docked]), layout)
+        body = along_x(at(start), 60)
+        body += [boolean(at(t), value, "/docked") for t, value in said.items()]
+        write_splits(tmp_path, body, 1000, f"rec{start}", layout)
     memory = memory_of(tmp_path, recalls=recalls)
     for start in (0, 600):
         events = asked(memory, "recap", start=T0 + start, end=T0 + 659)["events"]
-        docked_events = [
-            (event["timestamp"] - T0, event["text"])
-            for event in events
-            if "/docked" in event["text"]
-        ]
-        assert docked_events == [(630.0, "/docked became true")]
+        [docked] = [event for event in events if "/docked" in event["text"]]
+        assert (docked["timestamp"], docked["text"]) == (T0 + 630, "/docked became true")
         *_, stop = (event for event in events if event["text"].startswith("stood at"))
         assert "before" not in stop
     reply = before(memory, 605.0)
@@ -549,7 +544,7 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     messages = along_x(BEGIN, 100, mps=0.1)
     messages += history((10, {1: 2}), (40, {1: 4}), (60, {1: 4, 2: 2}))
     write_splits(tmp_path, messages, layout=McapLayout(latched=frozenset({TOPIC})))
-    write_splits(tmp_path, [odom(BEGIN + at * S) for at in range(900, 950)], name="next")
+    write_splits(tmp_path, along_x(BEGIN + 900 * S, 50), name="next")
     memory = memory_of(tmp_path)
 
     def held(word: str, begin: int, end: int) -> object:

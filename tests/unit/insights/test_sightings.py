@@ -44,7 +44,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -391,8 +391,7 @@ def test_diagnostics_of_one_node_go_on_while_others_report(
             report(second + 0.75, motor=(0, "ok")),
         ]
     write_splits(tmp_path, reported, split_s)
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
     ask = partial(asked, memory, topic="/diagnostics")
 
     def sightings(kind: str, **how: object) -> list[tuple[float, float, int]]:

@@ -147,7 +147,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
         window = {"start": T0 + 40, "end": T0 + until}
         recap = asked(memory, "recap", **window)
         assert [note for note in recap.get("notes", ()) if after in note] == notes
-    messages = [odom(BEGIN + t * S) for t in range(55, 60)]
+    messages = along_x(BEGIN + 55 * S, 5)
     write_mcap(tmp_path / "later" / "later_0.mcap", messages)
     memory.index.refresh()
     assert after not in shown(memory)["doubts"]
@@ -289,7 +289,7 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
 def recording(folder: Path, *listed: tuple[str, int]) -> None:
     """Two splits of five messages each, and a metadata.yaml that lists those given."""
     for split in range(2):
-        messages = [odom(BEGIN + (10 * split + t) * S) for t in range(5)]
+        messages = along_x(BEGIN + 10 * split * S, 5)
         write_mcap(folder / f"rec_{split}.mcap", messages)
     names = "".join(f"  - {name}\n" for name, _ in listed)
     files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)

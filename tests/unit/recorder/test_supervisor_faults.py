@@ -160,7 +160,7 @@ def test_once_its_splits_can_be_read_again_and_one_is_closed_that_fault_is_past(
     world: World,
 ) -> None:
     for _ in range(2):
-        with broken(world.reader, "closing", errno.ESTALE):
+        with broken(world.reader, "is_finished", errno.ESTALE):
             *_, reported = world.logged(12, "unreadable")
         assert reported["reason"] == world.heartbeat()["last_error"]
         assert world.heartbeat()["recovered"] is False
@@ -169,7 +169,7 @@ def test_once_its_splits_can_be_read_again_and_one_is_closed_that_fault_is_past(
     assert len(world.recorders) == 1
     # One that dies is replaced all the same.
     world.recorders[0].die()
-    with broken(world.reader, "closing", errno.ESTALE):
+    with broken(world.reader, "is_finished", errno.ESTALE):
         assert "Stale file handle" in world.logged(6, "unreadable")[0]["reason"]
     assert len(world.running) == 1
 
@@ -181,7 +181,7 @@ def test_each_split_that_cannot_be_read_is_named_once_and_is_past_once_all_can_b
     directory = world.recorders[0].directory
     early, late = (directory / f"{directory.name}_{number}.mcap" for number in (4, 5))
     for paths, named in (((early, late), (early, late)), ((early,), ())):
-        with broken(world.reader, "closing", errno.EACCES, where=paths.__contains__):
+        with broken(world.reader, "is_finished", errno.EACCES, where=paths.__contains__):
             reasons = [each["reason"] for each in world.logged(20, "unreadable")]
         assert reasons == [f"{path}: Permission denied" for path in named]
         beat = world.heartbeat()
