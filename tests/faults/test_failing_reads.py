@@ -8,7 +8,6 @@ import errno
 import os
 import random
 import resource
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,12 +15,10 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.columns.fill import RETRY_NS, Progress
-from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.history.context import Memory
 from ros2_memory.index.file_state import RETRY_SOON_NS
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.base import BagReader
-from ros2_memory.storage.errors import reading
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.faults.failing_disk import LOOK, OPEN, PASSING, failing
@@ -174,31 +171,3 @@ def test_too_many_open_files_are_a_fault_that_passes(tmp_path: Path, kind: str, 
         ask_honest(fresh, right)
     clock.at += RETRY_SOON_NS
     assert told(fresh, count=COUNT) == right
-
-
-def of_sqlite(code: int) -> sqlite3.OperationalError:
-    error = sqlite3.OperationalError(f"as sqlite puts {code}")
-    error.sqlite_errorcode = code
-    return error
-
-
-@pytest.mark.parametrize(
-    ("error", "kind"),
-    [
-        (OSError(errno.EIO, "Input/output error"), BagUnreachableError),
-        (OSError(errno.ESTALE, "Stale file handle"), BagUnreachableError),
-        (OSError(errno.ENOENT, "No such file or directory"), BagVanishedError),
-        (MemoryError(), BagUnreachableError),
-        (ValueError("no such record"), BagError),
-        (of_sqlite(sqlite3.SQLITE_IOERR_READ), BagUnreachableError),
-        (of_sqlite(sqlite3.SQLITE_CANTOPEN), BagUnreachableError),
-        (of_sqlite(sqlite3.SQLITE_NOMEM), BagUnreachableError),
-        (of_sqlite(sqlite3.SQLITE_CORRUPT), BagError),
-        (of_sqlite(sqlite3.SQLITE_NOTADB), BagError),
-    ],
-    ids=repr,
-)
-def test_what_may_pass_is_told_from_damage(error: Exception, kind: type[BagError]) -> None:
-    with pytest.raises(BagError) as raised, reading(Path("a.mcap")):
-        raise error
-    assert type(raised.value) is kind

@@ -1,5 +1,7 @@
 """A damaged chunk costs its own messages, and is reported where these were looked for."""
 
+import errno
+import sqlite3
 import tempfile
 from collections import Counter
 from collections.abc import Callable
@@ -13,7 +15,13 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.core.errors import BagContradictionError, BagError, UndecodableError
+from ros2_memory.core.errors import (
+    BagContradictionError,
+    BagError,
+    BagUnreachableError,
+    BagVanishedError,
+    UndecodableError,
+)
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Memory
 from ros2_memory.storage.base import BagReader, Channel, Record, Schema
@@ -106,25 +114,39 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
         assert "a_0.mcap could not be read whole" in found["notes"][0]
 
 
+def of_sqlite(code: int) -> sqlite3.OperationalError:
+    error = sqlite3.OperationalError(f"as sqlite puts {code}")
+    error.sqlite_errorcode = code
+    return error
+
+
 @pytest.mark.parametrize(
-    "foreign",
+    ("foreign", "kind"),
     [
-        MemoryError(),
-        KeyError(1),
-        OSError(5, "Input/output error"),
-        RuntimeError("LZ4F_decompress\nfailed"),
-        AssertionError(),
-        UnreadableError("its reason"),
-        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
+        (OSError(errno.EIO, "Input/output error"), BagUnreachableError),
+        (OSError(errno.ESTALE, "Stale file handle"), BagUnreachableError),
+        (OSError(errno.ENOENT, "No such file or directory"), BagVanishedError),
+        (MemoryError(), BagUnreachableError),
+        (KeyError(1), BagError),
+        (RuntimeError("LZ4F_decompress\nfailed"), BagError),
+        (AssertionError(), BagError),
+        (UnreadableError("its reason"), BagError),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), BagError),
+        (of_sqlite(sqlite3.SQLITE_IOERR_READ), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_CANTOPEN), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_NOMEM), BagUnreachableError),
+        (of_sqlite(sqlite3.SQLITE_CORRUPT), BagError),
+        (of_sqlite(sqlite3.SQLITE_NOTADB), BagError),
     ],
-    ids=lambda error: type(error).__name__,
+    ids=repr,
 )
-def test_every_foreign_exception_becomes_an_error_about_the_file(
-    foreign: Exception, tmp_path: Path
+def test_every_foreign_exception_becomes_an_error_about_the_file_and_says_what_may_pass(
+    foreign: Exception, kind: type[BagError]
 ) -> None:
-    path = tmp_path / "bag.mcap"
+    path = Path("bag.mcap")
     with pytest.raises(BagError) as caught, reading(path):
         raise foreign
+    assert type(caught.value) is kind
     assert caught.value.path == str(path)
     assert caught.value.reason
     assert "\n" not in caught.value.reason
