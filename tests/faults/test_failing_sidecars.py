@@ -3,7 +3,6 @@
 import errno
 import os
 from pathlib import Path
-from typing import NoReturn
 
 import pytest
 
@@ -20,24 +19,18 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.handover import settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.faults.world import write_bag
+from tests.support.fakes import broken
 from tests.support.handovers import recover_handovers
 
 HIDDEN = Handover(state=Counting.VOID)
 
 
-def fails(_path: Path) -> NoReturn:
-    raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
-def test_messages_that_do_not_count_do_not_come_in_because_the_disk_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_that_do_not_count_do_not_come_in_because_the_disk_fails(tmp_path: Path) -> None:
     path = write_bag(tmp_path, 0)
     write_handover(path.parent, HIDDEN)
     everything = TimeWindow.everything()
     reader = BagDirReader(McapReader())
-    with monkeypatch.context() as patched:
-        patched.setattr(handovers, "read_small_file", fails)
+    with broken(handovers, "read_small_file", errno.EIO):
         with pytest.raises(BagUnreachableError, match=r"handover\.json cannot be read: Input"):
             reader.summarize(path)
         with pytest.raises(BagUnreachableError):
@@ -46,48 +39,34 @@ def test_messages_that_do_not_count_do_not_come_in_because_the_disk_fails(
     assert reader.summarize(path).empty
 
 
-def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(tmp_path: Path) -> None:
     path = write_bag(tmp_path, 0)
     old, new = path.parent, tmp_path / "rec_2"
     new.mkdir()
     begun = Handover(next="rec_2", notes=("a note",))
     write_handover(old, begun)
     write_handover(new, Handover(state=Counting.PENDING, previous="rec"))
-    with monkeypatch.context() as patched:
-        patched.setattr("ros2_memory.storage.file_io.os.open", fails_to_open)
+    with broken(os, "open", errno.EIO, where=lambda path, *_: str(path).endswith(".mcap")):
         with pytest.raises(BagUnreachableError, match="Input/output error"):
             settle_handover(old, new, McapReader())
         recover_handovers(tmp_path, McapReader())
     assert read_handover(old).handover == begun
-    with monkeypatch.context() as patched:
-        patched.setattr(handovers, "read_small_file", fails)
-        with pytest.raises(RecorderError, match="cannot be read"):
-            settle_handover(old, new, McapReader())
+    broken_disk = broken(handovers, "read_small_file", errno.EIO)
+    with broken_disk, pytest.raises(RecorderError, match="cannot be read"):
+        settle_handover(old, new, McapReader())
     assert read_handover(old).handover == begun
     settle_handover(old, new, McapReader())
     assert read_handover(new).handover.state is Counting.COUNTS
 
 
 def test_a_handover_that_did_not_begin_is_settled_once_the_disk_gives_its_sidecar(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     old, new = tmp_path / "rec", tmp_path / "rec_2"
     old.mkdir()
     write_handover(old, Handover(next="rec_2"))
-    with monkeypatch.context() as patched:
-        patched.setattr(handovers, "read_small_file", fails)
-        with pytest.raises(RecorderError, match="cannot be read"):
-            settle_handover(old, new, McapReader(), ("rec",))
+    broken_disk = broken(handovers, "read_small_file", errno.EIO)
+    with broken_disk, pytest.raises(RecorderError, match="cannot be read"):
+        settle_handover(old, new, McapReader(), ("rec",))
     assert settle_handover(old, new, McapReader(), ("rec",))
     assert read_handover(old).handover.next is None
-
-
-real_open = os.open
-
-
-def fails_to_open(path: str | Path, *arguments: int, **named: int) -> int:
-    if str(path).endswith(".mcap"):
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-    return real_open(path, *arguments, **named)

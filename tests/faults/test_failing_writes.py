@@ -12,7 +12,7 @@ from ros2_memory.columns.fill import Progress
 from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import fill_up, plainly, served, store_of, told, write_bags
 from tests.support.column_worlds import store_file
-from tests.support.fakes import files_limited_to
+from tests.support.fakes import broken, files_limited_to
 
 
 @pytest.mark.parametrize("size", [4096, 20_000])
@@ -44,18 +44,12 @@ def test_a_store_that_cannot_be_written_costs_no_answer_and_is_filled_later(
 @pytest.mark.parametrize("function", ["fsync", "open", "replace"])
 @pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC, errno.EROFS])
 def test_what_cannot_be_replaced_stands_and_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, number: int
+    tmp_path: Path, function: str, number: int
 ) -> None:
     names = [tmp_path / "handover.json", tmp_path / "other.json"]
     for each in names:
         write_durably(each, "as it was")
-
-    def fail(path: object, *_: object, **__: object) -> None:
-        raise OSError(number, os.strerror(number), str(path))
-
-    with monkeypatch.context() as patched:
-        patched.setattr(os, function, fail)
-        with pytest.raises(OSError, match=os.strerror(number)):
-            write_all_durably(dict.fromkeys(names, "anew"))
+    with broken(os, function, number), pytest.raises(OSError, match=os.strerror(number)):
+        write_all_durably(dict.fromkeys(names, "anew"))
     assert [each.read_text() for each in names] == ["as it was"] * 2
     assert sorted(tmp_path.iterdir()) == sorted(names)

@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections import Counter
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from ros2_memory.lake.warehouse import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.fakes import broken
 from tests.support.fleets import START_S
 from tests.support.housekeepers import own_all
 from tests.support.lakes import (
@@ -234,32 +236,23 @@ def test_a_list_of_what_was_forgotten_that_cannot_be_read_keeps_its_robot_from_b
     assert "forgotten.jsonl: line 1" in done.problems[0]
 
 
-def test_killed_while_shipping_and_while_forgetting_it_is_finished_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def full_after(commits: int) -> AbstractContextManager[None]:
+    left = iter(range(commits))
+    return broken(SqlCatalog, "commit_table", where=lambda *_: next(left, None) is None)
+
+
+def test_killed_while_shipping_and_while_forgetting_it_is_finished_later(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
     ship_from(tmp_path)
     secret_bag(bag_dir)
-    commit = SqlCatalog.commit_table
-    left = 4  # tables with rows of the bag, besides `bags`
-
-    def failing(*given: object) -> object:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise OSError(28, "No space left on device")
-        return commit(*given)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(SqlCatalog, "commit_table", failing)
-    with pytest.raises(LakeError, match="No space left"):
+    # Those commits succeed that come before: of tables with rows of the bag, besides `bags`.
+    with full_after(4), pytest.raises(LakeError, match="No space left"):
         ship_from(tmp_path)
     # Its rows are there, but in `bags`.
     assert files_with(lake, MARKER)
-    left = 3
-    with pytest.raises(LakeError, match="No space left"):
+    with full_after(3), pytest.raises(LakeError, match="No space left"):
         forget(lake, TOMBSTONE)
-    left = 10**6
     assert tombstones(location(lake).state_dir) == [(TOMBSTONE, False)]
     assert forget(lake, TOMBSTONE).bags == 1
     assert tombstones(location(lake).state_dir) == [(TOMBSTONE, True)]
