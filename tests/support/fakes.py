@@ -53,8 +53,14 @@ def broken(
 
 
 @contextmanager
-def killed_at(owner: object, name: str) -> Iterator[None]:
-    """The program is killed when it calls a function, which ends the block."""
-    killed = patch.object(owner, name, side_effect=KeyboardInterrupt)
-    with killed, pytest.raises(KeyboardInterrupt):
+def killed_at(owner: object, name: str, nth: int = 1) -> Iterator[None]:
+    """The program is killed when it calls a function for the nth time, which ends the block."""
+    work, before = getattr(owner, name), iter(range(1, nth))
+
+    def call(*given: Any, **how: Any) -> Any:
+        if next(before, None) is None:
+            raise KeyboardInterrupt
+        return work(*given, **how)
+
+    with patch.object(owner, name, call), pytest.raises(KeyboardInterrupt):
         yield

@@ -24,7 +24,7 @@ from ros2_memory.retention.saved_moments import LONGEST_WAIT_NS, Share
 from tests.support.bags import McapLayout, odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
-from tests.support.fakes import broken
+from tests.support.fakes import broken, killed_at
 from tests.support.housekeepers import (
     NOW,
     T0,
@@ -224,7 +224,7 @@ def test_before_anything_is_deleted_a_pending_moment_goes_on(tmp_path: Path) -> 
     [(os, "link", 2), (saved_moments, "write_saved_moment", 2), (RequestQueue, "answer", 1)],
 )
 def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: Any, step: str, nth: int
+    tmp_path: Path, owner: Any, step: str, nth: int
 ) -> None:
     """It dies at its second link, as it writes what it made for the second time, or answers.
 
@@ -232,18 +232,8 @@ def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_complete
     """
     recording(tmp_path, A, 0)
     pending = asked(tmp_path, 15, 25)
-    done, real = [], getattr(owner, step)
-
-    def killed(*given: Any, **options: Any) -> None:
-        done.append(step)
-        if len(done) == nth:
-            raise KeyboardInterrupt
-        real(*given, **options)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(owner, step, killed)
-        with pytest.raises(KeyboardInterrupt):
-            house_of(tmp_path).keep_moments()
+    with killed_at(owner, step, nth):
+        house_of(tmp_path).keep_moments()
     house_of(tmp_path).keep_moments()
     outcome = pending.outcome()
     assert outcome is not None
