@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
+from ros2_memory.core.arrays import numbered, rows_by
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
@@ -378,16 +379,13 @@ def _batch_by_channel(places: list[int], records: list[Record]) -> Iterator[Batc
     log_times = np.array([record.log_time for record in records], np.int64)
     publish_times = np.array([record.publish_time for record in records], np.int64)
     starts = np.cumsum(sizes) - sizes
+    in_file = np.array(places, np.int64)
     # By identity: to hash a channel hashes the text of its definition.
-    rows_by_channel: dict[int, list[int]] = {}
-    for row, record in enumerate(records):
-        rows_by_channel.setdefault(id(record.channel), []).append(row)
-    for rows in rows_by_channel.values():
-        channel = records[rows[0]].channel
-        whole = Batch(
-            channel, log_times, publish_times, np.array(places, np.int64), buffer, starts, sizes
-        )
-        yield whole.select(np.array(rows, np.int64))
+    channels, channel_of = numbered(id(record.channel) for record in records)
+    for rows in rows_by(channel_of, len(channels)):
+        channel = records[int(rows[0])].channel
+        whole = Batch(channel, log_times, publish_times, in_file, buffer, starts, sizes)
+        yield whole.select(rows)
 
 
 def errors_as_items(items: Iterator[T]) -> Iterator[T | BagError]:
