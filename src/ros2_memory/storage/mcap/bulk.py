@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from ros2_memory.core.arrays import gathered, run_starts
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
+from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, batched
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import (
     Chunk,
@@ -235,20 +235,20 @@ def batches_of(
         return iter(())
     at, heads = message_heads(content, messages)
     order = _by_channel(messages, window)
-    stated, logged = heads["publish_time"][order], messages.times[order]
+    messages = messages.select(order)
+    stated, logged = heads["publish_time"][order], messages.times
     # An unsigned time past the signed range has become negative. Some writers write 0 for unknown.
     published = np.where((stated <= 0) | (stated == MAX_NS), logged, stated)
     sizes = heads["length"] - MESSAGE_FIELDS  # an aligned copy: taking rows of it is faster
     payloads = _Payloads(published, content.buffer, at[order] + MESSAGE.size, sizes[order])
-    batches = _batch_by_channel(messages, order, content.chunks, channels, payloads)
-    if not _are_frames(payloads.buffer, payloads.starts, payloads.sizes).any():
+    batches = _batch_by_channel(messages, content.chunks, channels, payloads)
+    if not _has_frames(payloads.buffer, payloads.starts, payloads.sizes):
         return batches
     return chain.from_iterable(_uncompressed(batch, uncompressed) for batch in batches)
 
 
 def _batch_by_channel(
     messages: MessageTable,
-    order: IntArray,
     chunks: Sequence[Chunk],
     channels: Mapping[int, Channel],
     payloads: _Payloads,
@@ -256,15 +256,14 @@ def _batch_by_channel(
     """Yields a batch for each channel.
 
     Args:
-        messages: the messages of the chunks.
-        order: which rows of `messages` are wanted, channel by channel.
+        messages: messages of the chunks, channel by channel.
         chunks: the chunks.
         channels: the channels by number.
-        payloads: the payloads of the wanted messages, in this order.
+        payloads: the payloads of the messages.
     """
-    numbers, times = messages.channels[order], messages.times[order]
+    numbers, times = messages.channels, messages.times
     first_places = np.array([first_place(chunk) for chunk in chunks])
-    places = messages.offsets[order] + first_places[messages.chunks[order]]
+    places = messages.offsets + first_places[messages.chunks]
     for first, last in pairwise([*run_starts(numbers).tolist(), numbers.size]):
         rows = slice(first, last)
         yield Batch(
@@ -287,8 +286,8 @@ def _by_channel(messages: MessageTable, window: TimeWindow) -> IntArray:
 
 def _uncompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
     """Yields a batch, or several if rosbag2 compressed its messages."""
-    are_frames = _are_frames(batch.buffer, batch.starts, batch.sizes)
-    if batch.channel.encoding != "cdr" or not are_frames.any():
+    has_frames = _has_frames(batch.buffer, batch.starts, batch.sizes)
+    if batch.channel.encoding != "cdr" or not has_frames:
         yield batch
         return
     records = map(batch.record, range(batch.sizes.size))
@@ -298,14 +297,10 @@ def _uncompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
     yield from batched(zip(batch.places.tolist(), plain, strict=True))
 
 
-def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
-    """Returns a mask of the payloads that begin with the magic of a zstd frame."""
-    is_long = sizes >= len(FRAME_MAGIC)
-    if not is_long.all():
-        starts = starts[is_long]
-    are_frames = np.zeros(is_long.size, np.bool_)
-    are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
-    return are_frames
+def _has_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> bool:
+    """Returns whether one of the payloads begins with the magic of a zstd frame."""
+    starts = starts[sizes >= len(FRAME_MAGIC)]
+    return bool((gathered(buffer, _UINT32, starts) == _MAGIC).any())
 
 
 def bare_batches(
@@ -318,7 +313,7 @@ def bare_batches(
     """
     for group, indexes in index_groups(file, chunks):
         messages = read_indexes(group, indexes, channels)
-        order = _by_channel(messages, window)
-        zeros = np.zeros(order.size, np.int64)
-        payloads = _Payloads(messages.times[order], b"", zeros, zeros)
-        yield from _batch_by_channel(messages, order, group, channels, payloads)
+        messages = messages.select(_by_channel(messages, window))
+        zeros = np.zeros(messages.times.size, np.int64)
+        payloads = _Payloads(messages.times, b"", zeros, zeros)
+        yield from _batch_by_channel(messages, group, channels, payloads)

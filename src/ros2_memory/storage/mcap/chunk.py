@@ -114,8 +114,8 @@ class MessageTable(NamedTuple):
             np.zeros(np.count_nonzero(is_possible), np.int64),
         )
 
-    def select(self, rows: Mask) -> MessageTable:
-        """Returns the messages where the mask is set."""
+    def select(self, rows: IntArray | Mask) -> MessageTable:
+        """Returns the messages at these positions, or where the mask is set."""
         return MessageTable(*(column[rows] for column in self))
 
 
