@@ -7,6 +7,7 @@ the two counts: within a folder, messages are not compared, so all of them would
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -24,8 +25,6 @@ from ros2_memory.index.scan import BAG_DIR_SETTING, UNSEEN, ScanResult, Stamp, T
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.file_io import OpenFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -178,7 +177,7 @@ class BagTable:
         """Returns the bags that are copies of others in their folder; reads each pair once."""
         compared, self._compared = self._compared, {}
         for pair in _likely_copies(self._timeline):
-            with suppress(OSError, UnreadableError):
+            with suppress(OSError):
                 self._compared[pair] = compared[pair] if pair in compared else _is_copy(*pair)
         return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
 
@@ -416,7 +415,7 @@ def _is_copy(original: BagFile, bag: BagFile) -> bool:
     Equal times and sizes prove nothing: two runs of a simulation may have them.
 
     Raises:
-        OSError, UnreadableError: one of them cannot be read.
+        OSError: one of them cannot be read.
     """
     return _read_blocks(original) == _read_blocks(bag)
 
@@ -424,5 +423,8 @@ def _is_copy(original: BagFile, bag: BagFile) -> bool:
 def _read_blocks(bag: BagFile) -> list[bytes]:
     step = max(bag.size // _BLOCKS, _BLOCK_BYTES)
     offsets = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
-    with OpenFile(bag.path) as file:
-        return [file.read(offset, min(_BLOCK_BYTES, bag.size - offset)) for offset in offsets]
+    file = os.open(bag.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        return [os.pread(file, _BLOCK_BYTES, offset) for offset in offsets]
+    finally:
+        os.close(file)
