@@ -54,7 +54,11 @@ if TYPE_CHECKING:
 Session: TypeAlias = frozenset[str]
 """The folders of its recordings, by their names when they were recorded."""
 
+_MessageKey: TypeAlias = tuple[str, Ns, Ns, int]
+"""Topic, log time and identity of a message."""
 _BETWEEN_THINNED_NS: Final[Ns] = NS_PER_S
+_MOST_DECODED: Final = 500
+"""After so many messages with moving transforms, those of the newest lookup alone are kept."""
 _FEW_SESSIONS: Final = 4
 """After this many sessions, the static transforms of all are looked up at once."""
 _UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
@@ -103,6 +107,8 @@ class Sessions:
         self._recordings = view.timeline.memo.of(_RECORDINGS, dict)
         self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
         self._static: dict[Session, Sequence[StampedTransform]] = {}
+        # Of the newest lookups: the next one is often at nearly the same time.
+        self._moving: dict[_MessageKey, Sequence[StampedTransform]] = {}
         self._looked_up = 0  # sessions whose static transforms were not cached
         self._lending: dict[tuple[str, Ns], Session] = {}
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
@@ -350,8 +356,19 @@ class Sessions:
         extents = self.bags_of(session, topics, window)
         merged = self._view.stream.merged(extents, topics, window)
         tracked = self._view.bags.track_sources(merged)
-        of_session = (stored for stored in tracked if self.has(session, stored))
-        return [*decoded_transforms(self._view, of_session)]
+        decoded: dict[_MessageKey, Sequence[StampedTransform]] = {}
+        found: list[StampedTransform] = []
+        for stored in tracked:
+            if self.has(session, stored):
+                key = (stored.topic, stored.time, *stored.identity)
+                transforms = self._moving.get(key)
+                if transforms is None:
+                    transforms = tuple(decoded_transforms(self._view, [stored]))
+                found += transforms
+                if transforms:  # else a note may have to say why, once more
+                    decoded[key] = transforms
+        self._moving = decoded if len(self._moving) > _MOST_DECODED else self._moving | decoded
+        return found
 
     def received(self, session: Session | None, rows: Rows) -> Iterator[StampedTransform]:
         """Yields the transforms of a session, or with None of all, in the messages of rows."""

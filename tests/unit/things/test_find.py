@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.timeline import Timeline
+from ros2_memory.storage.base import Record
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import estimation, known, places, synonyms, unseen
 from ros2_memory.things.find import find_things
@@ -829,6 +830,25 @@ def test_of_a_marker_without_a_place_it_is_said_that_transforms_may_have_it(
     given: dict[str, Any] = {} if label is None else {"label": label}
     assert "places as transforms: list_frames, get_transform_at" in str(ask(tmp_path, **given))
     assert "as transforms" not in str(ask(tmp_path, label="cup"))
+
+
+def test_transforms_of_a_sighting_are_decoded_once_for_the_robot_and_the_thing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.0)))
+    memory, decoded = memory_of(tmp_path), list[tuple[str, bytes]]()
+
+    def decode(record: Record) -> object:
+        decoded.append((record.channel.topic, record.payload))
+        return type(reader).decode(reader, record)
+
+    reader = memory.reader
+    monkeypatch.setattr(reader, "decode", decode)
+    cup = {"topic": "/vision/scene/scene_objects", "condition_type": "contains", "value": "cup"}
+    [row] = asked(memory, "find_matches", **cup)["sightings"]
+    assert (row["robot"]["x"], row["place"]["x"]) == pytest.approx((1.0, 3.0), abs=0.05)
+    transforms = [payload for topic, payload in decoded if topic == "/tf"]
+    assert len(transforms) == len({*transforms}) > 0
 
 
 def test_a_place_that_is_given_as_near_is_said_to_be_one(tmp_path: Path) -> None:
