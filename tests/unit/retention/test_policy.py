@@ -98,6 +98,11 @@ def test_a_future_date_has_no_newest_hour() -> None:
     assert "m0" not in names(by_hours(held, budget(200)).to_delete)
 
 
+def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes() -> None:
+    before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+    assert expired(contents(*before, after), LIMITS) == ()
+
+
 def anew(clock: int, runs: int, now: int = NOW) -> DirContents:
     """Runs of four minutes, by a clock that begins at a time with each of them."""
     bags = [
