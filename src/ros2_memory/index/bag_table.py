@@ -267,19 +267,18 @@ class BagTable:
             for row, (path, content) in enumerate(
                 zip(bags.files(), map(tuple, bags.contents.tolist()), strict=True)
             ):
-                stamp = stamps.get(path)
-                if stamp is None or stamp.content != content:
-                    are_settled[row] = False
-                elif (
-                    not are_settled[row]
-                    or stamp.mtime_ns >= context.settled_before
-                    or not path.endswith(kinds)
-                    or (compressed and other_form(path) in compressed)
-                ):
-                    are_settled[row] = False
-                    others[path] = bags[row]
-                else:
+                stamp = stamps.get(path, UNSEEN)
+                is_same = stamp.content == content
+                are_settled[row] &= (
+                    is_same
+                    and stamp.mtime_ns < context.settled_before
+                    and path.endswith(kinds)
+                    and not (compressed and other_form(path) in compressed)
+                )
+                if are_settled[row]:
                     del stamps[path]
+                elif is_same:
+                    others[path] = bags[row]
             settled = bags.select(are_settled)
             if settled is not None:
                 segments.append(Segment(settled))
