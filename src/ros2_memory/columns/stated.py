@@ -44,7 +44,7 @@ from ros2_memory.core.text import dotted
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.columns.table import Table, Texts
+    from ros2_memory.columns.table import Table
     from ros2_memory.core.arrays import Floats
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
@@ -96,8 +96,8 @@ class StatedColumns:
         return FromColumns(Stated(table.log_times, facts), unsure)
 
 
-class StatusNames:
-    """Reads the names of the statuses in diagnostics; remembers where a type has them.
+class Nodes:
+    """Numbers the nodes that publish diagnostics, by the first status that a message has.
 
     Args:
         extractor: has the schema map.
@@ -105,16 +105,24 @@ class StatusNames:
 
     def __init__(self, extractor: SchemaExtractor) -> None:
         self._leaves = ByType(extractor, lambda shape: _entry_leaves(shape.value, shape.type).name)
+        self._numbers = {"": 0}
 
-    def of(self, table: Table) -> tuple[IntArray, Texts] | None:
-        """Returns the row of each status, ascending, and its name; None without such columns."""
+    def of(self, table: Table) -> IntArray | None:
+        """Returns the number of each row's node, 0 without a status; None if no column has it."""
+        nodes = np.zeros(len(table), np.int64)
+        if table.channel.type != DIAGNOSTICS:
+            return nodes
         leaf = self._leaves.of(table)
         if leaf is None or leaf.level.parent is not ROWS:
             return None
         try:
-            return Values(table).elements(leaf.level).owners, Values(table).texts(leaf)
+            names, owners = Values(table).texts(leaf), Values(table).elements(leaf.level).owners
         except UnknownShapeError:
             return None
+        numbers = [self._numbers.setdefault(name, len(self._numbers)) for name in names.words]
+        has_any, firsts = np.unique(owners, return_index=True)
+        nodes[has_any] = np.array(numbers, np.int64)[names.codes[firsts]]
+        return nodes
 
 
 Reader: TypeAlias = "Callable[[Values], tuple[Facts, IntArray]]"

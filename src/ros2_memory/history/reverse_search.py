@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals, at_field, plain_text
-from ros2_memory.analysis.facts import DIAGNOSTICS
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
-from ros2_memory.columns.stated import StatusNames
+from ros2_memory.columns.stated import Nodes
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.columns.values import TruthValues, nowhere
-from ros2_memory.core.arrays import places_among, rows_of, stacked
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, listed
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.stored import PartZones
+    from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
@@ -72,7 +72,7 @@ class Tested:
         times: log times (ns).
         met: `MET`, `NOT_MET` or `UNKNOWN` for each message.
         sources: the number of each message's recording and type, which orders equal log times.
-        nodes: of diagnostics, on whose topic many nodes publish, a number for each node; else 0.
+        nodes: the numbers of the nodes that publish diagnostics; else 0.
     """
 
     times: IntArray
@@ -119,17 +119,8 @@ class RowCondition:
         return self._test.may_match(parts)
 
     def unstated(self, rows: Rows) -> Mask:
-        """Returns which rows of the table lack the field; of rows that count alone, if decoded."""
-        unstated = self._test.unstated(rows.table)
-        if unstated is not None:
-            return unstated
-        index = rows.positions
-        unstated = np.zeros(len(rows.table), np.bool_)
-        for positions, decoded in decoded_rows(self._view, rows):
-            of_bag = self._test.unstated(decoded.table)
-            if of_bag is not None:
-                unstated[index[positions]] = of_bag[decoded.index]
-        return unstated
+        """Returns which rows that count lack the field."""
+        return by_columns(self._view, rows, self._test.unstated).astype(np.bool_)
 
     def truth(self, rows: Rows) -> TruthValues:
         """Returns which rows of the table meet the condition.
@@ -153,6 +144,19 @@ class RowCondition:
                 self._left_to_messages.add(channel.type)
                 break
         return TruthValues(surely, perhaps)
+
+
+def by_columns(view: View, rows: Rows, read: Callable[[Table], IntArray | Mask | None]) -> IntArray:
+    """Returns what is read for each row that counts from its table, else from its bag, else 0."""
+    of_table = read(rows.table)
+    if of_table is not None:
+        return of_table[rows.positions].astype(np.int64)
+    numbers = np.zeros(len(rows), np.int64)
+    for positions, decoded in decoded_rows(view, rows):
+        of_bag = read(decoded.table)
+        if of_bag is not None:
+            numbers[positions] = of_bag[decoded.positions]
+    return numbers
 
 
 def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
@@ -303,8 +307,7 @@ class ReverseSearch:
         require_frame(view, self.topics, condition)
         self.ruled_out = False
         self._test = RowCondition(view, condition)
-        self._status_names = StatusNames(view.extractor)
-        self._nodes: dict[str, int] = {}
+        self._nodes = Nodes(view.extractor)
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
@@ -486,7 +489,7 @@ class ReverseSearch:
         self.ruled_out |= not perhaps.all()
         source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
         met = surely.astype(np.uint8)
-        met[self._test.unstated(rows)[counting] & ~surely] = UNKNOWN
+        met[self._test.unstated(rows) & ~surely] = UNKNOWN
         undecided = np.flatnonzero(perhaps & ~surely)
         # A message that cannot be read is no match; a note reports it.
         met[undecided] = NOT_MET
@@ -495,31 +498,12 @@ class ReverseSearch:
             for nth, message in messages_at(self._view, rows.some(neighbours)):
                 is_match = self.matches(message)
                 met[neighbours[nth]] = UNKNOWN if is_match is None else int(is_match)
-        tested = Tested(rows.times, met, np.full(len(rows), source), self._nodes_of(rows))
+        nodes = by_columns(self._view, rows, self._nodes.of)
+        tested = Tested(rows.times, met, np.full(len(rows), source), nodes)
         if topic in self._view.moving_topics and plain_text(self.condition.test):
             # A message of transforms that does not name a frame says nothing of it.
             return rows_of(tested, met == MET)
         return tested
-
-    def _nodes_of(self, rows: Rows) -> IntArray:
-        """Returns a number for the node of each row: for the first status that it names."""
-        nodes = np.zeros(len(rows), np.int64)
-        if rows.table.channel.type != DIAGNOSTICS:
-            return nodes
-        parts: Iterable[tuple[IntArray, Rows]] = [(np.arange(len(rows)), rows)]
-        if self._status_names.of(rows.table) is None:
-            parts = decoded_rows(self._view, rows)
-        for positions, part in parts:
-            named = self._status_names.of(part.table)
-            if named is None:
-                continue
-            owners, names = named
-            has_any, firsts = np.unique(owners, return_index=True)
-            places, is_among = places_among(has_any, part.positions)
-            numbers = [self._nodes.setdefault(name, len(self._nodes) + 1) for name in names.words]
-            firsts_among = names.codes[firsts[is_among]]
-            nodes[positions[places[is_among]]] = np.array(numbers, np.int64)[firsts_among]
-        return nodes
 
     def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns a number for each recording and type of a topic, in the order of `Rows.order`."""

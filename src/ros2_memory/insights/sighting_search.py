@@ -6,12 +6,13 @@ See `insights.sightings`. A match while the scope does not hold counts as no mat
 from __future__ import annotations
 
 import heapq
+from collections import defaultdict
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.facts import DIAGNOSTICS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
@@ -83,8 +84,8 @@ class SearchedRuns:
         return [Run(self.topics[topic], *run) for topic, *run in self.table[which].tolist()]
 
 
-class _TopicRuns:
-    """Joins the blocks of one topic, the newest first, into runs.
+class _NodeRuns:
+    """Joins the messages of one topic, on diagnostics of one node, the newest first, into runs.
 
     Args:
         topic: its number.
@@ -93,64 +94,34 @@ class _TopicRuns:
             topic (None) none holds through a silence.
     """
 
-    def __init__(self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None) -> None:
+    def __init__(self, topic: int, *, apart: bool, breaks: Ints | None) -> None:
         self._topic = topic
         self._apart = apart
-        self._breaks = None if breaks is None else np.array(breaks, np.int64)
+        self._breaks = breaks
         self._tables: list[Ints] = []
-        # Whether the oldest run may go on in an older block.
-        self._is_open = False
+        # Whether the oldest run may go on in an older message.
+        self.is_open = False
         # The log time of the oldest message; MAX_NS if it is unknown what follows an older one.
         self._begins: Ns = MAX_NS
-        self._waiting: list[Tested] = []
-        self._messages = 0
 
     def tables(self, *, cut: bool) -> list[Ints]:
         """Returns tables of runs. With `cut` an oldest run that may go on has no known begin."""
-        self._join()
-        if not (cut and self._is_open):
+        if not (cut and self.is_open):
             return self._tables
         *newer, last = self._tables
         oldest = last.copy()
         oldest[-1, _BEGUN] = 0
         return [*newer, oldest]
 
-    def add(self, block: Block) -> None:
-        """Adds the next older block."""
-        if not block.has_match:
-            self._join()
-            if not self._is_open:
-                self._begins = MAX_NS
-                return
-        self.add_messages(block.tested())
-
-    def add_messages(self, tested: Tested) -> None:
-        """Adds the next older messages."""
-        if tested.times.size:
-            # One by one, many small blocks take long.
-            self._waiting.append(tested)
-            self._messages += tested.times.size
-            if self._messages >= _MOST_WAITING:
-                self._join()
-
-    def is_open(self) -> bool:
-        """Returns whether the oldest run may go on in an older block."""
-        self._join()
-        return self._is_open
-
-    def _join(self) -> None:
-        """Joins the matches of the blocks that wait to the runs, which are newer."""
-        if not self._waiting:
-            return
-        tested = stacked(self._waiting[::-1])
-        self._waiting, self._messages = [], 0
+    def add(self, tested: Tested) -> None:
+        """Joins the matches of the next older messages to the runs."""
         after, self._begins = self._begins, int(tested.times[0])
         times, met = tested.times, tested.met
         is_silent = self._end_before(np.append(times, after))
-        goes_on = self._is_open and not is_silent[-1]
+        goes_on = self.is_open and not is_silent[-1]
         bounds, rows = np.flatnonzero((met == NOT_MET) | is_silent[:-1]), np.flatnonzero(met == MET)
         if not rows.size and not bounds.size:
-            self._is_open = goes_on
+            self.is_open = goes_on
             return
         # Bounds are messages that do not match, and silences: no run goes on across one.
         next_bound = np.searchsorted(bounds, rows, side="right")
@@ -169,7 +140,7 @@ class _TopicRuns:
             runs = runs[1:]
         if len(runs):
             self._tables.append(runs)
-        self._is_open = not self._apart and next_bound[:1].tolist() == [0]
+        self.is_open = not self._apart and next_bound[:1].tolist() == [0]
 
     def _end_before(self, times: Ints) -> Flags:
         """Returns for each log time whether no run goes on to it from the one before."""
@@ -178,58 +149,72 @@ class _TopicRuns:
         broken = np.searchsorted(self._breaks, times)
         return np.diff(broken, prepend=broken[0]) > 0
 
-    def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
-        """Ends the oldest run if the topic has a message in a time that is not searched.
-
-        If no run goes on then, it is unknown what follows an older one.
-        """
-        self._join()
-        if not self._is_open or (not gap.empty and view.stream.first([topic], gap) is not None):
-            self._is_open, self._begins = False, MAX_NS
+    def end(self) -> None:
+        """Ends the oldest run; it is not known what follows an older one."""
+        self.is_open, self._begins = False, MAX_NS
 
 
-class _DiagnosticRuns:
-    """Joins the blocks of a topic of diagnostics, the newest first, into the runs of each node.
+class _TopicRuns:
+    """Joins the blocks of one topic, the newest first, into runs.
 
-    A message says nothing of what other nodes report.
+    Diagnostics of a node say nothing of what other nodes report: each has runs of its own.
 
     Args:
         topic: its number.
+        apart, breaks: see `_NodeRuns`.
     """
 
-    def __init__(self, topic: int) -> None:
-        self._topic = topic
-        self._nodes: dict[int, _TopicRuns] = {}
-        # Blocks without a match after the oldest one that was added, the newest first.
-        self._without_match: list[Block] = []
+    def __init__(self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None) -> None:
+        times = None if breaks is None else np.array(breaks, np.int64)
+        new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times)
+        self._by_node: dict[int, _NodeRuns] = defaultdict(new_runs)
+        self._waiting: list[Tested] = []
+        self._messages = 0
+        # Blocks without a match that are older than all that were added, the newest first.
+        self._skipped: list[Block] = []
 
     def tables(self, *, cut: bool) -> list[Ints]:
-        """Returns tables of runs; see `_TopicRuns.tables`."""
-        return [table for node in self._nodes.values() for table in node.tables(cut=cut)]
+        """Returns tables of runs; see `_NodeRuns.tables`."""
+        self._join()
+        return [table for runs in self._by_node.values() for table in runs.tables(cut=cut)]
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
-        if not block.has_match and not any(node.is_open() for node in self._nodes.values()):
-            self._without_match.append(block)
+        if not block.has_match and not self._is_open():
+            self._skipped.append(block)
             return
-        # They end the runs of this block if their messages follow soon enough.
-        for newer in self._without_match:
-            if newer.first - block.last <= SILENCE_NS:
-                self._add_messages(newer.tested())
-        self._without_match = []
-        self._add_messages(block.tested())
+        # What follows the matches of this block before a silence ends their runs.
+        near = [newer for newer in self._skipped if newer.first - block.last <= SILENCE_NS]
+        self._skipped = []
+        for tested in [found.tested() for found in (*near, block)]:
+            # One by one, many small blocks take long.
+            self._waiting.append(tested)
+            self._messages += tested.times.size
+        if self._messages >= _MOST_WAITING:
+            self._join()
 
-    def _add_messages(self, tested: Tested) -> None:
+    def _is_open(self) -> bool:
+        """Returns whether a run may go on in an older block."""
+        self._join()
+        return any(runs.is_open for runs in self._by_node.values())
+
+    def _join(self) -> None:
+        """Joins the messages of blocks that wait to the runs of their nodes."""
+        if not self._messages:
+            return
+        tested = stacked(self._waiting[::-1])
+        self._waiting, self._messages = [], 0
         for node in np.unique(tested.nodes).tolist():
-            runs = self._nodes.get(node)
-            if runs is None:
-                runs = self._nodes[node] = _TopicRuns(self._topic, apart=False, breaks=None)
-            runs.add_messages(rows_of(tested, tested.nodes == node))
+            self._by_node[node].add(rows_of(tested, tested.nodes == node))
 
     def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
-        """Ends the oldest runs if the topic has a message in a time that is not searched."""
-        for node in self._nodes.values():
-            node.end_in(view, topic, gap)
+        """Ends the oldest runs if the topic has a message in a time that is not searched.
+
+        If none goes on then, it is unknown what follows an older one.
+        """
+        if not self._is_open() or (not gap.empty and view.stream.first([topic], gap) is not None):
+            for runs in self._by_node.values():
+                runs.end()
 
 
 def find_runs(
@@ -258,10 +243,8 @@ def find_runs(
     latched = [topic for topic in breaks if scope.is_bounded]
     if latched:
         enough = None
-    by_topic: dict[str, _TopicRuns | _DiagnosticRuns] = {
-        topic: _DiagnosticRuns(nth)
-        if DIAGNOSTICS in view.timeline.types_of(topic)
-        else _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
+    by_topic = {
+        topic: _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
         for nth, topic in enumerate(topics)
     }
     windows = [scope.window] if latched else scope.narrowed()
@@ -293,7 +276,7 @@ def _blocks_newest_first(
     search: ReverseSearch,
     scope: Scope,
     windows: Iterable[TimeWindow],
-    by_topic: Mapping[str, _TopicRuns | _DiagnosticRuns],
+    by_topic: Mapping[str, _TopicRuns],
 ) -> Iterator[Block]:
     """Yields the blocks of all topics in windows, the newest first; ends runs between windows."""
     searched = scope.window.stop
@@ -354,17 +337,15 @@ def _in_scope(block: Block, scope: Scope) -> Block:
     return block._replace(tested=test)
 
 
-def _has_enough(
-    by_topic: Collection[_TopicRuns | _DiagnosticRuns], enough: int, reached: Ns
-) -> bool:
+def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:
     """Returns whether the newest runs are known, whatever matches before a moment (ns) follow."""
     runs = _newest_first(by_topic, cut=True)
     newest = runs[:enough]
     return len(runs) > enough and newest[-1, _LAST] >= reached and bool(newest[:, _BEGUN].all())
 
 
-def _newest_first(by_topic: Collection[_TopicRuns | _DiagnosticRuns], *, cut: bool) -> Ints:
-    """Returns the runs of all topics in one table; see `_TopicRuns.tables`."""
+def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool) -> Ints:
+    """Returns the runs of all topics in one table; see `_NodeRuns.tables`."""
     tables = [table for topic_runs in by_topic for table in topic_runs.tables(cut=cut)]
     return _in_order(np.concatenate([np.empty((0, len(Run._fields)), np.int64), *tables]))
 
