@@ -16,6 +16,7 @@ from ros2_memory.core.arrays import (
     Columns,
     Ints,
     distinct_rows,
+    entries_of_codes,
     runs_where,
     stable_order,
 )
@@ -29,65 +30,64 @@ if TYPE_CHECKING:
     from ros2_memory.things.labels import Labels
     from ros2_memory.things.observations import Observations
 
-_FEWEST_LABELS: Final = 3
+_LABELS_MISSED: Final = 3
 """Fewer things may have been taken away together."""
-_FEWEST_LOOKS: Final = 3
-_USUAL_SHARE: Final = 0.5
-"""What is usual from a cell is in so many, and such a share, of its looks that saw anything, ..."""
-_FEWEST_USUAL: Final = 2
-"""... and a cell from which so many labels are usual counts as a place of its own, ..."""
-_APART_MM: Final = 1000.0
-"""... so far from another one, ..."""
-_APART_DEG: Final = 60.0
-"""... or so far turned from it."""
+_LABELS_OF_VIEW: Final = 2
+"""A view in which so many labels are usual is compared with others."""
+_LOOKS_OF_USUAL: Final = 3
+"""What was seen less often from a cell is not usual there."""
+_SHARE_OF_USUAL: Final = 0.5
+"""What is usual is in such a share of the looks from its cell that saw anything."""
+_OTHER_VIEW_MM: Final = 1000.0
+_OTHER_VIEW_DEG: Final = 60.0
 _AT_ONCE_NS: Final = 20 * NS_PER_S
 """What was seen so shortly before is gone from one moment to the next."""
 
 
-def seeing_messages(observed: Observations, labels: Labels) -> tuple[Ints, list[BlindTime]]:
-    """Returns how many messages of each look are of a seeing detector, and when one was blind.
+def without_blind_looks(
+    observed: Observations, labels: Labels
+) -> tuple[JoinedSights, list[BlindTime]]:
+    """Returns sights without the looks of blind detectors, and when these were blind.
 
-    Of the looks next to a blind time, those count that saw what they saw most.
+    Of the looks next to a blind time, as many messages count as have what was seen most.
     """
     cells, sights = observed.cells, observed.sights
-    seeing = cells.n.astype(np.int64)
+    views, firsts = _Views(observed, labels), cells.looks.first
+    messages = cells.n.astype(np.int64)
     times: list[BlindTime] = []
-    views = _Views(observed, labels)
-    has_pose, firsts = cells.yaw != NO_YAW, cells.looks.first
     for number, topic in enumerate(sights.topics):
-        looks = np.flatnonzero((cells.topic == number) & has_pose)
+        looks = np.flatnonzero((cells.topic == number) & (cells.yaw != NO_YAW))
         looks = looks[stable_order(firsts[looks])]
         # The first columns of both tables are slice and topic.
         tables = (sights.spots, sights.unplaced)
-        seen = (table[table[:, Spot.TOPIC] == number, Spot.SLICE] for table in tables)
-        is_empty = ~np.isin(cells.slice[looks], np.concatenate([*seen]))
+        seen = [table[table[:, Spot.TOPIC] == number, Spot.SLICE] for table in tables]
+        is_empty = ~np.isin(cells.slice[looks], np.concatenate(seen))
         for begin, end in runs_where(is_empty).tolist():
-            run = looks[begin:end]
-            if views.are_missed_in(run) or (begin and views.vanish(looks[begin - 1], run[0])):
-                beside = looks[[*range(begin)[-1:], *range(len(looks))[end : end + 1]]]
-                seeing[run] = 0
-                seeing[beside] = views.most_hits[beside]
+            run, around = looks[begin:end], looks[max(begin - 1, 0) : end + 1]
+            if views.lack_usual(run) or (begin and views.vanish(*around[:2].tolist())):
+                messages[around] = views.most_hits[around]
                 times.append(BlindTime(topic, int(firsts[run[0]]), int(cells.last[run].max())))
-    return seeing, times
+    return (_with_messages(sights, messages) if times else sights), times
 
 
-def without_blind(sights: JoinedSights, seeing: Ints) -> JoinedSights:
-    """Returns sights with fewer messages of looks, and without looks that have none left."""
-    stays = seeing > 0
+def _with_messages(sights: JoinedSights, messages: Ints) -> JoinedSights:
+    """Returns sights with so many messages of each look, without the looks that have none."""
+    stays = messages > 0
     number = np.cumsum(stays) - 1
     spot, look, n = (sights.hits[:, name] for name in Hit)
     look = np.where(look >= 0, number[look], look)
     looks = [*sights.looks.columns]
-    looks[Look.N] = seeing
+    looks[Look.N] = messages
     return replace(
         sights, looks=Columns(column[stays] for column in looks), hits=Columns((spot, look, n))
     )
 
 
 class _Views:
-    """Which labels are usual in the view from each cell: they are in half of what it saw.
+    """Which labels are usual from each cell; people and the like are usual nowhere.
 
-    People and the like are usual nowhere.
+    Attributes:
+        most_hits: for each look, how often its most frequent thing was detected.
     """
 
     def __init__(self, observed: Observations, labels: Labels) -> None:
@@ -95,47 +95,36 @@ class _Views:
         keys = map(labels.key, observed.sights.labels)
         stays = ~np.array([moves_by_itself(key) for key in keys], np.bool_)
         sizes, look, n = observed.hits.rows_of(np.arange(len(spots)))
-        self.most_hits = np.zeros(len(cells.slice), np.int64)
-        np.maximum.at(self.most_hits, look[look >= 0], n[look >= 0])
         label = np.repeat(spots[:, Spot.LABEL], sizes)
-        is_hit = (look >= 0) & stays[label]
-        seen, _ = distinct_rows([look[is_hit], label[is_hit]])
-        self._labels_of_look = _by_first(seen)
+        look, n, label = (column[look >= 0] for column in (look, n, label))
+        self.most_hits = np.zeros(len(cells.slice), np.int64)
+        np.maximum.at(self.most_hits, look, n)
+        seen, _ = distinct_rows([look[stays[label]], label[stays[label]]])
+        self._labels_in_look = np.bincount(seen[:, 0], minlength=len(cells.slice))
         seen_from, number = distinct_rows([cells.cell[seen[:, 0]], seen[:, 1]])
-        often = np.bincount(number, minlength=len(seen_from))
-        looks = np.bincount(cells.cell[np.unique(seen[:, 0])], minlength=len(cells.looks_in))
-        enough = np.maximum(_USUAL_SHARE * looks[seen_from[:, 0]], _FEWEST_LOOKS)
-        seen_from = seen_from[often >= enough]
-        self._usual_in_cell = _by_first(seen_from)
-        self._shows_usual = np.zeros(len(cells.looks_in), np.bool_)
-        self._shows_usual[seen_from[:, 0]] = True
+        times = np.bincount(number, minlength=len(seen_from))
+        seeing = cells.cell[self._labels_in_look > 0]
+        seeing_looks = np.bincount(seeing, minlength=len(cells.looks_in))[seen_from[:, 0]]
+        is_usual = times >= np.maximum(_SHARE_OF_USUAL * seeing_looks, _LOOKS_OF_USUAL)
+        self._usual_cells, self._usual_labels = seen_from[is_usual].T
         self._cells = cells
 
-    def are_missed_in(self, run: Ints) -> bool:
-        """Returns whether looks that saw nothing are from places where some labels are usual."""
-        run = run[self._shows_usual[self._cells.cell[run]]]
-        cells, firsts = np.unique(self._cells.cell[run], return_index=True)
-        usual = [self._usual_in_cell[cell] for cell in cells.tolist()]
-        if len(frozenset().union(*usual)) < _FEWEST_LABELS:
+    def lack_usual(self, looks: Ints) -> bool:
+        """Returns whether looks that saw nothing are from several views with usual labels."""
+        cells = self._cells
+        of_looks, row_of = np.unique(cells.cell[looks], return_inverse=True)
+        counts, rows = entries_of_codes(self._usual_cells, of_looks)
+        if len(np.unique(self._usual_labels[rows])) < _LABELS_MISSED:
             return False
-        several = np.array([len(labels) >= _FEWEST_USUAL for labels in usual])
-        looks = run[firsts[several]]
-        x, y, heading = self._cells.x[looks], self._cells.y[looks], self._cells.heading(looks)
+        looks = looks[counts[row_of] >= _LABELS_OF_VIEW]
+        x, y, heading = cells.x[looks], cells.y[looks], cells.heading(looks)
         away = np.hypot(x - x[:1], y - y[:1])
         turned = np.abs(half_turns(heading - heading[:1]))
-        return bool(((away >= _APART_MM) | (turned >= _APART_DEG)).any())
+        return bool(((away >= _OTHER_VIEW_MM) | (turned >= _OTHER_VIEW_DEG)).any())
 
     def vanish(self, before: int, after: int) -> bool:
         """Returns whether a look saw some labels, and the next one, from the same cell, none."""
         cells = self._cells
         pause = cells.looks.first[after] - cells.last[before]
         is_same_view = cells.cell[before] == cells.cell[after] and pause <= _AT_ONCE_NS
-        return is_same_view and len(self._labels_of_look.get(before, ())) >= _FEWEST_LABELS
-
-
-def _by_first(pairs: Ints) -> dict[int, frozenset[int]]:
-    """Returns the second numbers of pairs by their first ones."""
-    seconds: dict[int, set[int]] = {}
-    for first, second in pairs.tolist():
-        seconds.setdefault(first, set()).add(second)
-    return {first: frozenset(those) for first, those in seconds.items()}
+        return bool(is_same_view and self._labels_in_look[before] >= _LABELS_MISSED)

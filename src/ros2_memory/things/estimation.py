@@ -27,7 +27,7 @@ from ros2_memory.core.arrays import (
     rows_by,
     stable_order,
 )
-from ros2_memory.things.blindness import seeing_messages, without_blind
+from ros2_memory.things.blindness import without_blind_looks
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -81,9 +81,8 @@ def estimate(
     again; its errors end the estimate.
     """
     observed = Observations(sights, labels, min_score, go_on)
-    seeing, blind_times = seeing_messages(observed, labels)
+    sights, blind_times = without_blind_looks(observed, labels)
     if blind_times:
-        sights = without_blind(sights, seeing)
         observed = Observations(sights, labels, min_score, go_on)
     names = _names_to_show(sights, labels)
     keys = with_synonyms(sights, observed.counts, labels, go_on)
