@@ -584,8 +584,8 @@ def _getter(message: object, path: Segments) -> Callable[[object], object] | Non
         layout = layout_of_class(cls)
         if layout is None or layout.kind is not ValueKind.PLAIN or name not in layout.fields:
             return None
-        attribute, summarize = layout.fields[name]
-        if summarize is not None:
+        attribute, convert = layout.fields[name]
+        if convert is not None:
             return None
         attributes.append(attribute)
         node = getattr(node, attribute)

@@ -445,9 +445,8 @@ def _last_placed(
 ) -> tuple[StoredMessage, Pose] | None:
     """Returns the newest message of a window whose pose can be placed in `frame_id`, or None."""
     messages = view.stream.messages([topic], window, newest_first=True)
-    for stored in islice(messages, _MOST_TRIED):
-        message = view.bags.decode(stored)
-        pose = None if message is None else view.extractor.pose(message, stored.type)
+    for stored, message in view.bags.decoded(islice(messages, _MOST_TRIED)):
+        pose = view.extractor.pose(message, stored.type)
         with suppress(NoDataError):
             if pose is not None:
                 return stored, _place_pose(view, stored, pose, frame_id)

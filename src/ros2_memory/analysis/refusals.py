@@ -54,13 +54,19 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
 
 def _hint_on_json(value: JsonValue) -> str:
     """Returns the fields of the JSON that is all of a value, and how to search it as a text."""
-    text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
-    if not isinstance(text, str) or not looks_like_json(text):
+    text = _json_text(value)
+    if text is None:
         return ""
     return (
         f", a text of JSON, with {_fields_of_json(text)}: contains and contains_word look for "
         "words in it, and min_score leaves out detections"
     )
+
+
+def _json_text(value: JsonValue) -> str | None:
+    """Returns the text of JSON that is all of a value; None if the value is anything else."""
+    text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
+    return text if isinstance(text, str) and looks_like_json(text) else None
 
 
 def _fields_of_json(text: str) -> str:
@@ -73,8 +79,8 @@ def lack_in_json(field: str, value: JsonValue) -> str | None:
 
     Other messages may have the field, so that this is no refusal.
     """
-    text = value.get("value") if isinstance(value, dict) and len(value) == 1 else None
-    if not field.startswith("value.") or not isinstance(text, str) or at_field(value, field):
+    text = _json_text(value)
+    if text is None or not field.startswith("value.") or at_field(value, field):
         return None
     return f"its newest JSON has no {field}, but {_fields_of_json(text)}"
 

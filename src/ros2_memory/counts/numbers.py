@@ -569,21 +569,18 @@ def number_paths(view: View, topic: str, fields: Sequence[str], until: Ns) -> tu
     The newest message before a log time (ns) shows what a field is.
     """
     stored = view.stream.last(topic, until) if fields else None
-    message = None if stored is None else view.bags.decode(stored)
-    paths: dict[str, None] = {}
+    message = view.bags.decode(stored)
+    paths: list[str] = []
     for field in fields:
         value: JsonValue = None
         if stored is not None and message is not None:
             value = view.extractor.exact_at(message, stored.type, field)
         parts: list[str] = []
         if isinstance(value, dict) and not isinstance(value, Summary):
-            parts = [
-                path
-                for path, inner in leaves_by_path(value, field)
-                if not isinstance(inner, str | bool)
-            ]
-        paths.update(dict.fromkeys(parts or [field]))
-    return tuple(paths)
+            leaves = leaves_by_path(value, field)
+            parts = [path for path, leaf in leaves if not isinstance(leaf, str | bool)]
+        paths += parts or [field]
+    return tuple(dict.fromkeys(paths))
 
 
 def _cells_of_fields(

@@ -14,7 +14,7 @@ from ros2_memory.messages.conversions import constants_of_field
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
@@ -29,8 +29,9 @@ _CONSTANT: Final = re.compile(
 )
 """A constant that is a whole number, in the text of a message definition, or in IDL."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
-_NUMBER_FIELD: Final = rf"^[ \t]*(?:{_INTEGER}|float[0-9]*|double)[ \t]+{{}}\b"
-_ANY_NUMBER_FIELD: Final = re.compile(_NUMBER_FIELD.format("([a-z][a-z0-9_]*)"), re.MULTILINE)
+_NUMBER_FIELD: Final = re.compile(
+    rf"^[ \t]*(?:{_INTEGER}|float[0-9]*|double)[ \t]+([a-z]\w*)", re.MULTILINE
+)
 _SEPARATOR: Final = re.compile(r"^={40,}[ \t]*$", re.MULTILINE)
 """A line between the definitions of a type and of its parts."""
 _MOST_CONSTANTS: Final = 16
@@ -50,20 +51,12 @@ def constant_number(view: View, value: JsonValue, field: str, type_name: str) ->
     shown, _, below = field.partition(".")
     path = below or ".".join(view.extractor.fields_of(type_name).get(shown, (shown,)))
     schemas = schemas_of(view, type_name)
-    for constants in (
-        chain.from_iterable(_constants_beside(schema, path) for schema in schemas),
-        chain.from_iterable(_constants_of(schema, path) for schema in schemas),
-    ):
+    for read in (_constants_beside, _constants_of):
+        constants = chain.from_iterable(read(schema, path) for schema in schemas)
         numbers = {number for constant, number in constants if constant == word}
         if numbers:
             return int(numbers.pop()) if len(numbers) == 1 else value
     return value
-
-
-def _constants_of(schema: Schema, path: str) -> list[tuple[str, str]]:
-    """Returns all constants of a definition, if a dot-path leads to a number in it."""
-    text = _text_of(schema)
-    return _CONSTANT.findall(text) if _has_number(text, path) else []
 
 
 def _constants_beside(schema: Schema, path: str) -> list[tuple[str, str]]:
@@ -71,16 +64,18 @@ def _constants_beside(schema: Schema, path: str) -> list[tuple[str, str]]:
     _, _, name = path.rpartition(".")
     constants: list[tuple[str, str]] = []
     for part in _SEPARATOR.split(_text_of(schema)):
-        if _has_number(part, path):
-            fields, of_part = _ANY_NUMBER_FIELD.findall(part), _CONSTANT.findall(part)
-            for field in [name] if name else fields:
-                constants += constants_of_field(field, fields, of_part)
+        fields = _NUMBER_FIELD.findall(part)
+        for field in fields:
+            if name in {"", field}:
+                constants += constants_of_field(field, fields, _CONSTANT.findall(part))
     return constants
 
 
-def _has_number(text: str, path: str) -> bool:
+def _constants_of(schema: Schema, path: str) -> list[tuple[str, str]]:
+    """Returns all constants of a definition, if a dot-path leads to a number in it."""
     _, _, name = path.rpartition(".")
-    return re.search(_NUMBER_FIELD.format(re.escape(name)), text, re.MULTILINE) is not None
+    text = _text_of(schema)
+    return _CONSTANT.findall(text) if name in _NUMBER_FIELD.findall(text) else []
 
 
 def names_of_numbers(
@@ -88,19 +83,23 @@ def names_of_numbers(
 ) -> Iterator[str]:
     """Yields for each type of a topic a sentence with the constants of some numbers in a field."""
     for type_name in view.timeline.types_of(topic):
+        schemas = schemas_of(view, type_name)
         constants = chain.from_iterable(
-            _constants_beside(schema, field or "") for schema in schemas_of(view, type_name)
+            _constants_beside(schema, field or "") for schema in schemas
         )
-        named = [f"{name} = {number}" for name, number in dict.fromkeys(constants)]
-        named = [name for name in named if name.rpartition(" ")[2] in numbers]
+        named = _listed(constant for constant in constants if constant[1] in numbers)
         if named:
-            yield f"numbers of {type_name}: {listed(named, at_most=_MOST_CONSTANTS)}"
+            yield f"numbers of {type_name}: {named}"
 
 
 def constants_listed(schema: Schema, field: str) -> str:
     """Returns the constants beside a field that is a number, with their values; empty if none."""
-    constants = dict.fromkeys(_constants_beside(schema, field))
-    return listed([f"{name} = {number}" for name, number in constants], at_most=_MOST_CONSTANTS)
+    return _listed(_constants_beside(schema, field))
+
+
+def _listed(constants: Iterable[tuple[str, str]]) -> str:
+    named = [f"{name} = {number}" for name, number in dict.fromkeys(constants)]
+    return listed(named, at_most=_MOST_CONSTANTS)
 
 
 def schemas_of(view: View, type_name: str) -> list[Schema]:

@@ -434,11 +434,11 @@ def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> It
     if 2 * close < max(len(runs), 2):
         return
     newest = _newest_match(view, search, runs[0])
-    message = None if newest is None else view.bags.decode(newest)
+    message = view.bags.decode(newest)
     if newest is None or message is None:
         return
     _, detections = _counted_content(view, search.condition, newest.type, message)
-    if any(map(search.condition.is_on, [detection.label for detection in detections])):
+    if any(search.condition.is_on(detection.label) for detection in detections):
         yield (
             f"{close} of these sightings end because the detector missed it for less than 3 s: "
             "with by they count as one with the next"

@@ -58,11 +58,11 @@ class MessageField(NamedTuple):
 
     Attributes:
         attribute: of the message object.
-        summarize: a function of the message and the field's value; None if it is shown in full.
+        convert: a function of the message and the field's value; None if it is shown as it is.
     """
 
     attribute: str
-    summarize: Callable[[object, object], object] | None = None
+    convert: Callable[[object, object], object] | None = None
 
 
 class Layout(NamedTuple):
@@ -108,7 +108,7 @@ def layout_of_class(cls: type) -> Layout | None:
             name = bare if keyword.iskeyword(bare) else field.name
             fields[name] = MessageField(field.name, summaries.get(name))
     for name, names in label_names(fields, constants).items():
-        fields[name] = fields[name]._replace(summarize=partial(_with_name, names))
+        fields[name] = fields[name]._replace(convert=partial(_with_name, names))
     return Layout(fields, kind_of_type(type_name, [*fields]))
 
 
@@ -280,8 +280,8 @@ def view(node: object, name: str) -> object:
     value = field_of(node, name)
     if kind is ValueKind.VECTOR:
         return Metric(value) if isinstance(value, float) else value
-    summarize = fields[name].summarize if name in fields else None
-    return value if summarize is None or value is ABSENT else summarize(node, value)
+    convert = fields[name].convert if name in fields else None
+    return value if convert is None or value is ABSENT else convert(node, value)
 
 
 class NamedNumber(int):
@@ -309,17 +309,14 @@ def label_names(
     Where constants begin with the name of the field (`LABEL_CAR`), that is no part of the name. A
     number of several constants has no name.
     """
-    names = [*fields] if constants else []
+    names = [*fields]
     named: dict[str, Mapping[int, str]] = {}
     for field in LABELS:
-        if field in names:
-            own = constants_of_field(field, names, constants)
+        own = constants_of_field(field, names, constants) if field in names else []
+        if own:
             counts = Counter(number for _, number in own)
-            named[field] = {
-                number: name.removeprefix(_prefix(field))
-                for name, number in own
-                if counts[number] == 1
-            }
+            prefix = _prefix(field)
+            named[field] = {n: name.removeprefix(prefix) for name, n in own if counts[n] == 1}
     return named
 
 

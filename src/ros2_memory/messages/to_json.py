@@ -173,10 +173,10 @@ class ExactJson:
             x, y, z = map(self._number, map(Metric, vector))
             return {"x": x, "y": y, "z": z}
         fields: JsonObject = {}
-        for name, (attribute, summarize) in layout.fields.items():
+        for name, (attribute, convert) in layout.fields.items():
             value: object = getattr(node, attribute, ABSENT)
-            if summarize is not None:
-                value = summarize(node, value)
+            if convert is not None:
+                value = convert(node, value)
             fields[name] = self.value(value, f"{path}.{name}" if path else name, depth)
         return fields
 

@@ -253,8 +253,8 @@ class Estimate:
 
         They are of its topic. 0 if the mover has other detections in this time.
         """
-        [row] = self.spots[np.array([spot])]
-        first, last, topic = row[[Spot.FIRST, Spot.LAST, Spot.TOPIC]].tolist()
+        names = [Spot.FIRST, Spot.LAST, Spot.TOPIC]
+        first, last, topic = self.spots[np.array([spot])][0, names].tolist()
         start, stop = first - SLICE_NS, last + SLICE_NS
         others = self.spots[mover.spots]
         is_near = (others[:, Spot.LAST] >= start) & (others[:, Spot.FIRST] <= stop)

@@ -435,12 +435,12 @@ def lone_notes(known: KnownThings, movers: Iterable[tuple[Mover, Ints]]) -> Iter
     """
     estimate = known.estimate
     for mover, rows in movers:
-        *before, last = np.sort(estimate.spots[rows, Spot.LAST]).tolist()
-        newest = int(rows[estimate.spots[rows, Spot.LAST] == last][0])
-        messages = estimate.alone_among(newest, mover)
+        lasts = estimate.spots[rows, Spot.LAST]
+        messages = estimate.alone_among(int(rows[lasts.argmax()]), mover)
         if messages >= _MANY_MESSAGES:
             name = estimate.names[mover.key]
-            earlier = f"; before that at {unix_text(before[-1])}" if before else ""
+            before = np.sort(lasts)[-2:-1].tolist()
+            earlier = f"; before that at {unix_text(*before)}" if before else ""
             yield repeating(
                 f"{name} was last seen in 1 of {messages} messages, which may be a false "
                 f"detection: find_matches has its score{earlier}",
