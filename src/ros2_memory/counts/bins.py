@@ -41,7 +41,13 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import TEXT, held_times, holds_on, is_latched
 from ros2_memory.history.no_data import no_data_between
-from ros2_memory.places.pose_frames import known_track, map_placement, placed_times, places_in
+from ros2_memory.places.pose_frames import (
+    known_track,
+    map_placement,
+    note_overlaps,
+    placed_times,
+    places_in,
+)
 from ros2_memory.places.where import Where, places_setting
 from ros2_memory.results import BinColumn, Bins, Usual
 
@@ -257,8 +263,7 @@ def place_bins(
     placed_spans = placed_times(known_track(view, placement.frame_id, counted).track, [])
     edges = _edges_at_spans(window, [*spans_inside, placed_spans])
     in_places = np.array([_lies_in_spans(edges, spans) for spans in spans_inside]).T
-    if (np.diff(edges)[in_places.sum(axis=1) > 1] > NS_PER_S).any():
-        view.notes.add("places overlap: what is in two of them counts to both")
+    note_overlaps(view, spans_inside)
     in_none = ~in_places.any(axis=1)
     placed = _lies_in_spans(edges, placed_spans)
     member = np.column_stack((in_places, in_none & placed, in_none & ~placed))

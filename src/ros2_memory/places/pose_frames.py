@@ -14,12 +14,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import merge
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.analysis.frames import HOLD_NS, is_odometry
-from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, jumps, place_at
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -490,6 +491,23 @@ def places_in(
                 f"{_body_there(view, place.frame_id, placement.pose_frame)}"
             )
     return tracks
+
+
+def note_overlaps(view: View, spans_of_places: Iterable[Spans]) -> None:
+    """Notes that places overlap, if a robot was in two of them at once.
+
+    For `FLICKER_NS` it is in two that only touch: where it passes the edge and comes back.
+
+    Args:
+        view: the view of this call.
+        spans_of_places: for each place, when the robot was there.
+    """
+    latest = MIN_NS
+    for start, stop in sorted(chain.from_iterable(spans_of_places)):
+        if min(latest, stop) - start > FLICKER_NS:
+            view.notes.add("places overlap: what is in two of them counts to both")
+            return
+        latest = max(latest, stop)
 
 
 @dataclass

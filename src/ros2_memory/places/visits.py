@@ -40,6 +40,7 @@ from ros2_memory.places.pose_frames import (
     MapPlacement,
     known_track,
     map_placement,
+    note_overlaps,
     placed_times,
     places_in,
 )
@@ -151,6 +152,7 @@ def _visits_of_places(
     rows = (confirmed.summary(place.name) for place, confirmed in stays_of_places)
     places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
     tracks = {place.frame_id: confirmed.known.track for place, confirmed in stays_of_places}
+    note_overlaps(view, [confirmed.of_first_robot for _, confirmed in stays_of_places])
     was_in_one = any(row.duration for row in places)
     note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
     return Visits(
@@ -339,6 +341,12 @@ class ConfirmedStays:
     def duration(self) -> Ns:
         """How long (ns) all visits lasted together, by the tracks."""
         return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.visits)
+
+    @property
+    def of_first_robot(self) -> Spans:
+        """When the robot was inside; of several at one time, the one of `known.track`."""
+        own = [visit.inside for visit in self.visits if visit.track is self.known.track]
+        return united((stay.start, stay.stop) for stay in own)
 
     def summary(self, name: str) -> PlaceVisits:
         """Returns how often and how long the robot was in the region, which has this name."""

@@ -299,6 +299,27 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
     assert "yard is left out" in str(found.notes)
 
 
+def test_times_of_places_that_overlap_are_noted_as_counted_to_both(moving: Memory) -> None:
+    room = Rectangle(-3.0, 2.0, -3.0, 6.0)
+    noted = "places overlap: what is in two of them counts to both"
+    nested = spots(moving, room=room, start=Rectangle(-0.6, 0.6, -0.6, 0.6))
+    assert noted in asked(nested, "visits")["notes"]
+    touching = asked(spots(moving, room=room, beside=Rectangle(2.0, 8.0, -3.0, 6.0)), "visits")
+    assert all(row["minutes"] > 0 for row in touching["places"])
+    assert noted not in touching.get("notes", [])
+
+
+def test_a_robot_that_looks_into_the_next_room_and_comes_back_is_not_in_two_at_once(
+    tmp_path: Path,
+) -> None:
+    """It drives 1.6 m over 16 s, and is beyond the edge at 1.5 m for some 2 s."""
+    memory = remembering(tmp_path, line((20, 0.0), (16, 0.1), (16, -0.1), (20, 0.0)))
+    rooms = spots(memory, here=Rectangle(-3, 1.5, -3, 3), there=Rectangle(1.5, 5, -3, 3))
+    reply = asked(rooms, "visits")
+    assert [row["entries"] for row in reply["places"] if row["place"] == "there"] == [1]
+    assert "places overlap" not in str(reply)
+
+
 def spots(memory: Memory, **where: Circle | Rectangle) -> Memory:
     places = tuple(Place(name, "odom", region) for name, region in where.items())
     return replace(memory, limits=replace(memory.limits, places=places))
@@ -383,7 +404,9 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
     def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
         return table(asked(memory, tool, **given))[row]
 
-    places = asked(memory, "visits")["places"]
+    of_places = asked(memory, "visits")
+    assert "places overlap" not in str(of_places["notes"])
+    places = of_places["places"]
     assert [(row["place"], row["exits"], row["minutes"]) for row in places] == [
         ("here", 1, 0.5),
         ("there", 1, 0.5),
