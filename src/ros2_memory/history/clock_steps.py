@@ -88,7 +88,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
         else:
             note = (
                 f"the clock was set back by {seconds(-by)} or more at {when}: durations across "
-                "that are too short by as much"
+                "that may be too short by as much, or too long if it was put right again"
             )
         view.notes.add(note)
     return Elapsed(steps)

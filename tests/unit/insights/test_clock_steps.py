@@ -307,6 +307,27 @@ def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path, recor
     assert recap["counts"]["clock steps"] == 1
 
 
+def test_a_duration_across_a_clock_that_was_set_back_and_put_right_may_be_too_long(
+    tmp_path: Path,
+) -> None:
+    """It is 20 s behind from 15 to 25 s; the robot is docked from 20 to 35 s, for 15 s."""
+    files: list[list[Msg]] = [[] for _ in range(5)]
+    for tick in range(500):
+        behind = 20 * S if 150 <= tick < 250 else 0
+        at = BEGIN * S + tick * S // 10 - behind
+        files[tick // 100].append(battery(at, 0.5))
+        if tick in (200, 350):
+            files[tick // 100].append(boolean(at + 1, tick == 200, "/docked"))
+    for nth, messages in enumerate(files):
+        layout = McapLayout(chunk_size=1 << 14)
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages, layout)
+    docked = {"topic": "/docked", "condition_type": "equals", "value": True}
+    reply = asked(memory_of(tmp_path), "find_matches", **docked)
+    assert [row["duration_s"] for row in reply["sightings"]] == [35.0]
+    [note] = [note for note in reply["notes"] if "durations across" in note]
+    assert "may be too short by as much, or too long if it was put right again" in note
+
+
 LENGTH = 30
 STALLS = ((8.0, 11.0), (16.0, 16.7))
 
