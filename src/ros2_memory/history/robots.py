@@ -354,10 +354,12 @@ def _parallel_recordings(
     return None
 
 
-def note_times_twice(view: View, window: TimeWindow) -> None:
-    """Notes which recordings have a time of a window twice, for what has the messages of both."""
+def note_times_twice(
+    view: View, window: TimeWindow, what: str = "both are here, mixed in the order of time"
+) -> None:
+    """Notes which recordings have a time of a window twice, and `what` the answer has of both."""
     for pair in times_recorded_twice(view, window):
-        view.notes.add(f"{pair.describe_by_clock('')}: both are here, mixed in the order of time")
+        view.notes.add(f"{pair.describe_by_clock('')}: {what}")
 
 
 def note_robots_on(

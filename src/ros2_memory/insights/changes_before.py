@@ -40,6 +40,7 @@ from ros2_memory.history.conditions import newest_above
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import held_at, is_latched
+from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (
     action_of,
@@ -398,7 +399,8 @@ def recap_before(
     window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
     changes = changes_in(view, window, {})
     past = changes.before(at, length, slack=SLACK_NS)
-    later = changes_in(view, TimeWindow(window.stop, min(at + _AFTER_NS + 1, MAX_NS)), {})
+    until = min(at + _AFTER_NS + 1, MAX_NS)
+    later = changes_in(view, TimeWindow(window.stop, until), {})
     robot, speed_mps = _pose_and_speed(view, at, frame_id)
     if not view.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
@@ -408,6 +410,8 @@ def recap_before(
         view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
     for topic, events in changes.events.items():
         note_left_out(view, topic, events)
+    what = "the pose, the state and the changes may be from before that or from after it"
+    note_times_twice(view, TimeWindow(window.start, until), what)
     note_unread(view, window)
     note_edges(view, window)
     return Before(

@@ -20,6 +20,8 @@ from tests.support.bags import (
     McapLayout,
     Msg,
     along_x,
+    boolean,
+    in_order,
     odom,
     text,
     tf,
@@ -254,6 +256,23 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
             there = asked(known, "get_position_at", timestamp=T0_S + at)
             assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
         assert len(whole["waypoints"]) == 4
+
+
+@each_way
+def test_what_was_so_around_a_time_that_a_recording_has_twice_has_a_note(
+    tmp_path: Path, recalls: bool
+) -> None:
+    run = tmp_path / "run"
+    states = [boolean(T0 + n * S, data=False) for n in range(100)]
+    write_mcap(run / "run_0.mcap", in_order([*driving(0, 100, 0.0), *states]))
+    states = [boolean(T0 + n * S, data=True) for n in range(60, 160)]
+    write_mcap(run / "run_1.mcap", in_order([*driving(60, 160, 50.5), *states]))
+    memory = memory_of(tmp_path, recalls=recalls)
+    for at, is_twice in ((40, False), (57, True), (80, True), (105, True), (140, False)):
+        notes = asked(memory, "recap", around=T0_S + at).get("notes", [])
+        twice = [note for note in notes if note.startswith("run has the time from")]
+        assert len(twice) == is_twice, at
+        assert all("may be from before that or from after it" in note for note in twice)
 
 
 @each_way
