@@ -16,7 +16,7 @@ import numpy as np
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES, Stated
 from ros2_memory.analysis.intervals import SILENCE_NS, IntervalTable, united_tables, visible_in
 from ros2_memory.core.arrays import joined_codes, run_starts, stable_order
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +28,8 @@ MAX_INTERVALS: Final = 100_000
 """How many intervals, which take less memory."""
 REPEATED_NS: Final = 2 * NS_PER_S
 """A log entry that follows a similar one within this time belongs to the same report."""
+_ERRORS_APART_NS: Final = 600 * NS_PER_S
+"""An error that comes again after a longer pause is another one: the robot went on meanwhile."""
 
 _BYTES: Final = 190
 """About how much memory a state, a change or a report takes."""
@@ -252,8 +254,8 @@ def _reports_of(stated: Stated, kind: str) -> list[Report]:
 
 
 def _merge_errors(errors: Iterable[Report]) -> tuple[Report, ...]:
-    """Merges equal errors into one report each, in order of the first."""
-    merged = _merge_reports(errors, str, MAX_NS)
+    """Merges equal errors that follow within `_ERRORS_APART_NS`, in order of the first."""
+    merged = _merge_reports(errors, str, _ERRORS_APART_NS)
     return tuple(sorted(merged, key=lambda error: (error.first, error.text)))
 
 

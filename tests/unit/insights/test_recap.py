@@ -84,6 +84,25 @@ def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recall
     assert ("low batteries", 2) in over(memory, 0, 449).counts
 
 
+@each_way
+def test_an_error_that_comes_again_long_after_is_another_event(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It is reported once a minute twice, in two rooms."""
+    often = [log_entry(at(t), 40, "brush", "stalled") for t in (5, 65, 605, 2400, 2460)]
+    poses = [odom(at(t), 0.0 if t < 1200 else 5.0) for t in range(0, 2500, 5)]
+    write_splits(tmp_path, in_order([*often, *poses]))
+    memory = memory_of(tmp_path, recalls=recalls)
+    reply = asked(memory, "recap", start=T0, end=T0 + 2500)
+    errors = [each for each in reply["events"] if each["text"].startswith("error")]
+    assert [(each["text"], each["duration_s"]) for each in errors] == [
+        ("error: brush: stalled (3 times)", 600.0),
+        ("error: brush: stalled (2 times)", 60.0),
+    ]
+    assert [each["timestamp"] - T0 for each in errors] == [5.0, 2400.0]
+    assert reply["counts"]["errors"] == 2
+
+
 def test_a_battery_without_a_known_charge_is_not_low(tmp_path: Path) -> None:
     told = [battery(BEGIN + at * S, 0.0) for at in range(60)]
     assert over(remembered(tmp_path, told), 0, 59).events == ()
