@@ -420,15 +420,11 @@ def texts_above(root: Node, dot_path: str) -> Iterator[tuple[Leaf, str]]:
         # A number picks an element of a list, which is the next node.
         is_pick = INDEX.fullmatch(path[nth]) is not None
         for node in nodes:
-            for leaf in () if is_pick and isinstance(node, list) else _leaves_outside(node):
-                if leaf.kind is Kind.TEXT:
+            if is_pick and isinstance(node, list):
+                continue
+            for leaf in conditions.leaves(node, in_objects=False):
+                if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT:
                     yield leaf, ".".join(path[nth:])
-
-
-def _leaves_outside(node: Node) -> Iterator[Leaf]:
-    """Yields a leaf, or those of a list."""
-    leaves = conditions.leaves(node, in_objects=False)
-    return (leaf for leaf in leaves if isinstance(leaf, Leaf))
 
 
 def _named_elements(array: list[Node], names: Leaf, name: str) -> list[Node]:

@@ -16,7 +16,7 @@ import json
 from bisect import bisect_left
 from collections import defaultdict
 from dataclasses import replace
-from itertools import groupby, pairwise
+from itertools import chain, groupby, pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
@@ -59,13 +59,13 @@ from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before, message_before
-from ros2_memory.messages.detections import naming_fields
+from ros2_memory.messages.detections import name_field
 from ros2_memory.places.where import Scope, Where, heard_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.model import JsonValue
@@ -293,18 +293,11 @@ def _is_label(view: View, topic: str, field: str, window: TimeWindow) -> bool:
             seen = view.stream.newest(topic, TimeWindow(window.start, max(lasts) + 1))
             value = None if seen is None else view.value(seen)
             objects = at_field(value, holder) if holder else [value]
-            return any(
-                next((own for own in naming_fields(found) if own in found), None) == name
-                for found in _objects_in(objects)
+            elements = chain.from_iterable(
+                found if isinstance(found, list) else [found] for found in objects
             )
+            return any(isinstance(one, dict) and name_field(one) == name for one in elements)
     return False
-
-
-def _objects_in(values: Sequence[JsonValue]) -> Iterator[dict[str, JsonValue]]:
-    """Yields the objects among values, and in lists among them."""
-    for value in values:
-        elements = value if isinstance(value, list) else [value]
-        yield from (element for element in elements if isinstance(element, dict))
 
 
 def _visible_by_events(

@@ -92,11 +92,6 @@ def names_of_numbers(
             yield f"numbers of {type_name}: {named}"
 
 
-def constants_listed(schema: Schema, field: str) -> str:
-    """Returns the constants beside a field that is a number, with their values; empty if none."""
-    return _listed(_constants_beside(schema, field))
-
-
 def _listed(constants: Iterable[tuple[str, str]]) -> str:
     named = [f"{name} = {number}" for name, number in dict.fromkeys(constants)]
     return listed(named, at_most=_MOST_CONSTANTS)
@@ -135,6 +130,18 @@ def constants_named(schema: Schema, field: str, word: str) -> list[str]:
     if not named:
         named = [(name, value) for name, value in constants if f"_{wanted}_" in f"_{name}_"]
     return [f"{name} = {value}" for name, value in named]
+
+
+def hint_on_constants(schema: Schema, field: str, word: str) -> str:
+    """Returns a clause on the constants that a word may mean, else on all of the field, if any."""
+    _, _, name = field.rpartition(".")
+    named = constants_named(schema, name, word)
+    if named:
+        # Without a field, the number would also match in the bytes of an id.
+        advice = "" if field else ": ask equals on the field of that number"
+        return f", such as {listed(named)}{advice}"
+    of_field = _listed(_constants_beside(schema, field))
+    return f", or one of {of_field}" if of_field else ""
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:

@@ -23,9 +23,9 @@ from ros2_memory.columns.values import TruthValues, nowhere
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, listed
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.condition_hints import constants_listed, constants_named, require_frame
+from ros2_memory.history.condition_hints import hint_on_constants, require_frame
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.held_values import is_text
@@ -428,15 +428,7 @@ class ReverseSearch:
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:
             return refusal
-        _, _, name = field.rpartition(".")
-        schema = newest.record.channel.schema
-        constants = constants_named(schema, name, word)
-        if not constants:
-            known = constants_listed(schema, field)
-            return f"{refusal}, or one of {known}" if known else refusal
-        # Without a field, the number would also match in the bytes of an id.
-        advice = "" if field else ": ask equals on the field of that number"
-        return f"{refusal}, such as {listed(constants)}{advice}"
+        return refusal + hint_on_constants(newest.record.channel.schema, field, word)
 
     def _is_beyond_shown(self, stored: StoredMessage, field: str) -> bool:
         """Returns whether a message has a field that its value, as replies show it, lacks."""

@@ -534,9 +534,8 @@ def _sighting(
 
 def _is_flag(condition: Condition) -> bool:
     """Returns whether a condition asks for true or false, which holds until a message toggles."""
-    if not isinstance(condition.test, Equals):
-        return False
-    return str(condition.test.value).casefold() in ("true", "false")
+    test = condition.test
+    return isinstance(test, Equals) and str(test.value).casefold() in {"true", "false"}
 
 
 def _counted_content(

@@ -117,6 +117,11 @@ def naming_fields(fields: Collection[str]) -> Iterator[str]:
             yield from _NAMES_OF_SEEN
 
 
+def name_field(value: JsonObject) -> str | None:
+    """Returns the first choice among the fields of an object that name it; None if none does."""
+    return next((name for name in naming_fields(value) if name in value), None)
+
+
 def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPTH) -> JsonValue:
     """Returns an extracted value without the detections whose score is below `min_score`.
 

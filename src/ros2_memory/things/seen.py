@@ -530,10 +530,10 @@ class SightReader:
 
 def _rows_once(rows: Rows, twice: Sequence[tuple[Path, TimeWindow]]) -> Rows:
     """Returns the rows without those of times that their recording has twice."""
-    spans = [span for recording, span in twice if recording == rows.recording]
-    if not spans:
-        return rows
-    return rows.some(np.flatnonzero(~np.any([span.holding(rows.times) for span in spans], axis=0)))
+    for recording, span in twice:
+        if recording == rows.recording:
+            rows = rows.some(np.flatnonzero(~span.holding(rows.times)))
+    return rows
 
 
 def _rows_in_slices(rows: Rows, slices: Sequence[int], start: Ns) -> Rows:
