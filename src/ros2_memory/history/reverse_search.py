@@ -541,13 +541,12 @@ def met_by_any(met: Mask, nodes: IntArray) -> Mask:
 
     What a node said before its first message is taken to be what that says.
     """
-    order = np.argsort(nodes, kind="stable")
-    is_met = met[order].astype(np.int64)
-    is_first = np.diff(nodes[order], prepend=-1) != 0
-    changes = np.empty_like(is_met)
-    changes[order] = np.where(is_first, 0, np.diff(is_met, prepend=0))
-    met_by: Mask = is_met[is_first].sum() + np.cumsum(changes) > 0
-    return met_by
+    is_met, places = np.zeros(len(met), np.bool_), np.arange(len(met))
+    for node in np.unique(nodes).tolist():
+        rows = np.flatnonzero(nodes == node)
+        newest = np.searchsorted(rows, places, side="right") - 1
+        is_met |= met[rows[np.maximum(newest, 0)]]
+    return is_met
 
 
 def _merged_and_split(waiting: Block, following: Block) -> tuple[Block | None, Block]:

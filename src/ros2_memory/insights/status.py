@@ -402,13 +402,14 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
     bag = view.timeline.bag_with(topic, type_name)
-    channels: Sequence[Channel] = view.memory.scanner.channels(view.timeline, bag)
+    why = view.memory.reader.undecodable
+    stored = view.memory.scanner.channels(view.timeline, bag)
+    channels = _channels_with(topic, type_name, stored)
     # Other bags are stored, too, also deleted ones: if they differ in this, the bag itself is read.
-    if len({*_reasons_of(view, channels, topic, type_name)}) != 1:
-        channels = view.bags.channels(bag)
-    reason = next(filter(None, reversed(_reasons_of(view, channels, topic, type_name))), None)
-    own = (channel for channel in channels if (channel.topic, channel.type) == (topic, type_name))
-    if reason is None and any(not channel.schema.text.strip() for channel in own):
+    if len({*map(why, channels)}) != 1:
+        channels = _channels_with(topic, type_name, view.bags.channels(bag))
+    reason = next(filter(None, map(why, reversed(channels))), None)
+    if reason is None and any(not channel.schema.text.strip() for channel in channels):
         return _why_first_undecodable(view, topic, type_name)
     return reason
 
@@ -427,15 +428,8 @@ def _why_first_undecodable(view: View, topic: str, type_name: str) -> str | None
     return next((failure.reason for failure in failures), None)
 
 
-def _reasons_of(
-    view: View, channels: Sequence[Channel], topic: str, type_name: str
-) -> list[str | None]:
-    """Returns for each channel of a topic and type why it cannot be decoded; None if it can."""
-    return [
-        view.memory.reader.undecodable(channel)
-        for channel in channels
-        if channel.topic == topic and channel.type == type_name
-    ]
+def _channels_with(topic: str, type_name: str, channels: Sequence[Channel]) -> list[Channel]:
+    return [one for one in channels if (one.topic, one.type) == (topic, type_name)]
 
 
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:

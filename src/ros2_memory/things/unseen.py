@@ -210,7 +210,7 @@ def blind_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator
     """Yields a sentence for each detector that was blind in some windows."""
     spans: dict[str, list[str]] = {}
     for blind in known.by_all.estimate.blind:
-        if any(blind.first < window.stop and blind.last >= window.start for window in windows):
+        if any(window.overlaps(blind.first, blind.last) for window in windows):
             span = f"from {unix_text(blind.first)} to {unix_text(blind.last)}"
             spans.setdefault(blind.topic, []).append(span)
     for topic, of_topic in spans.items():
