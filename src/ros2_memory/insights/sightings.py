@@ -111,7 +111,7 @@ def find_matches(
     found = _select_rows(view, topic, condition, scope, selection)
     topics, is_never = matching_topics(view, topic), found.total == 0
     elapsed = view.elapsed_in(found.searched)
-    rows = [_with_durations(row, elapsed, other) for row in found.rows]
+    rows = [_with_durations(view, row, elapsed, other) for row in found.rows]
     note_robots_on(view, topics, found.searched)
     note_unread(view, found.searched, nothing=is_never, search=True)
     if is_never:
@@ -195,17 +195,24 @@ def _select_rows(
 
 
 def _with_durations(
-    row: Sighting | Episode, elapsed: Elapsed, other: MeanwhileReader | None
+    view: View, row: Sighting | Episode, elapsed: Elapsed, other: MeanwhileReader | None
 ) -> Sighting | Episode:
     """Returns a row with how much of its time does not count, and what was said meanwhile."""
     skipped = elapsed.skipped_between(row.first, row.until)
     if isinstance(row, Episode):
         skipped = row.until - row.first - elapsed.among(row.parts)
-    return replace(
-        row,
-        skipped=skipped,
-        said=None if other is None else other.during(row.first, row.until),
-    )
+    said = None if other is None else other.during(row.first, _known_until(view, row))
+    return replace(row, skipped=skipped, said=said)
+
+
+def _known_until(view: View, row: Sighting | Episode) -> Ns:
+    """Returns until when (ns, exclusive) a row is known to have gone on.
+
+    A topic that repeats a state may have left it at any time after its last match.
+    """
+    if isinstance(row, Episode) or not row.messages or holds_on(view, [row.topic]):
+        return row.until
+    return row.last + 1
 
 
 def _goal_sightings(

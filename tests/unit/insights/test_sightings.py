@@ -776,6 +776,22 @@ def test_a_latched_value_that_is_said_again_is_one_sighting(tmp_path: Path, reca
 
 
 @each_way
+@pytest.mark.parametrize(("begun_s", "rooms"), [(19, ["Hall", "Study"]), (19.5, ["Hall"])])
+def test_with_has_what_held_up_to_the_last_message_that_repeats_a_state(
+    tmp_path: Path, recalls: bool, begun_s: float, rooms: list[str]
+) -> None:
+    """The next one, a second later, says that it is over, and not since when."""
+    bumps = [boolean(BEGIN + n * S, 10 <= n < 20) for n in range(40)]
+    entered = {0: "Hall", begun_s: "Study", 30: "Hall"}
+    said = [text(BEGIN + round(at * S), room, "/room") for at, room in entered.items()]
+    memory = remembered(tmp_path, [*bumps, *said], recalls=recalls)
+    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    [row] = asked(memory, "find_matches", **{"with": "/room"}, **bumped)["sightings"]
+    assert (row["last_seen"], row["duration_s"]) == (T0 + 19, 10.0)
+    assert [said["value"] for said in row["with"]] == rooms
+
+
+@each_way
 def test_with_takes_a_field_of_a_topic_whose_messages_have_several(
     tmp_path: Path, recalls: bool
 ) -> None:
