@@ -32,7 +32,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import Summary, names_beside, names_others
+from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -50,6 +50,8 @@ _MOST_TRIED: Final = 200
 """At most this many messages are read to find one that says something of the field."""
 _MOST_CHARS: Final = 16 << 20
 """The most characters of values (as JSON text) that a call may hold in memory."""
+_MOST_LISTED: Final = 8
+"""How many fields a refusal lists."""
 
 
 class HeldValue(NamedTuple):
@@ -152,12 +154,17 @@ class HeldValues:
             how = f"as {self._topic}.FIELD" if asked == "with" else "where the tool takes fields"
             advice = self._advice_on_element(newest) or (
                 "ask about a topic that has one, such as std_msgs/msg/String, or name one of its "
-                f"fields, {how}"
+                f"fields, {how}{self._fields_in(value)}"
             )
             raise InvalidArgumentsError(
                 f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "
                 f"boolean, which holds until the next one: {advice}"
             )
+
+    def _fields_in(self, value: JsonValue) -> str:
+        """Returns the end of a sentence: fields of an object that hold a value; or nothing."""
+        names = [name for name, _ in single_values(value, self._field or "")]
+        return f": {listed(names, at_most=_MOST_LISTED)}" if names else ""
 
     def _advice_on_element(self, stored: StoredMessage) -> str:
         """Returns which single value to ask for if the field leads through a list; else nothing."""

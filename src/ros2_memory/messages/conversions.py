@@ -12,7 +12,7 @@ import keyword
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from enum import Enum, auto
 from functools import lru_cache, partial
 from operator import attrgetter
@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 import numpy as np
 
 from ros2_memory.core import geometry
-from ros2_memory.core.text import LABELS
+from ros2_memory.core.text import LABELS, dotted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from ros2_memory.core.model import Quaternion, Vector3
+    from ros2_memory.core.model import JsonValue, Quaternion, Vector3
 
 Array: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
@@ -347,6 +347,16 @@ class Summary(dict[str, V]):
     """Stands for a large array: its size and shape without its content."""
 
     __slots__ = ()
+
+
+def single_values(value: JsonValue, path: str = "") -> Iterator[tuple[str, str | float | bool]]:
+    """Yields the numbers, texts and booleans of nested objects by dot-path, but not of headers."""
+    if isinstance(value, str | int | float):
+        yield path, value
+    elif isinstance(value, dict) and not isinstance(value, Summary):
+        for name, inner in value.items():
+            if name != "header":
+                yield from single_values(inner, dotted(path, name))
 
 
 _NUMBERS: Final = (int, float, np.number)  # as a tuple: a union is made anew with each call

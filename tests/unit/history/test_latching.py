@@ -254,3 +254,32 @@ def test_a_refusal_says_how_to_ask_what_a_rare_text_said_last(
     assert asked(asking, "get_topic_at_time", **given)["value"] == {"value": "SCOUTING"}
     # Between two runs nobody knows.
     assert "to accept" not in at(asking, "/mission", T0 + 1300 * S)["detail"]
+
+
+def test_refusals_of_any_text_and_of_a_message_without_one_value_say_what_to_ask(
+    tmp_path: Path,
+) -> None:
+    words = [text(T0 + at * S, word) for at, word in enumerate(("hello", "hello", "bye"))]
+    logs = [log_entry(T0 + at * S, 20, "nav", f"goal {at}") for at in range(3)]
+    moving = [odom(T0 + at * S, at) for at in range(3)]
+    write_mcap(tmp_path / "run" / "run_0.mcap", in_order([*words, *logs, *moving]))
+    memory = memory_of(tmp_path)
+    span = {"start": T0 / S, "end": T0 / S + 2}
+
+    blank = {"topic": "/chatter", "condition_type": "contains", "value": ""}
+    for by in ({}, {"by": "value"}):
+        refused = asked(memory, "find_matches", **blank, **by)["detail"]
+        assert "not blank; for example" in refused
+        assert refused.endswith(
+            "for any text, get_topic_in_range with changes lists each that a topic, or one of its "
+            "fields, held"
+        )
+    for topic, fields, total in (("/chatter", [], 2), ("/rosout", ["msg"], 3)):
+        listed = asked(
+            memory, "get_topic_in_range", topic=topic, fields=fields, changes=True, **span
+        )
+        assert listed["total"] == total
+
+    refused = asked(memory, "get_topic_in_range", topic="/odom", changes=True, **span)["detail"]
+    assert "name one of its fields, where the tool takes fields: position.x, position.y" in refused
+    assert refused.endswith("linear_velocity.x, linear_velocity.y and 4 more")
