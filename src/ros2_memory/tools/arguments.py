@@ -65,6 +65,7 @@ LONGEST_AFTER_S: Final = 600.0
 """How far a saved moment may reach before and after now."""
 LONGEST_REASON_S: Final = 60.0
 """How far before a time `recap` looks for changes (`around`)."""
+_FOR_LONGER: Final = ": for a longer time give start and end, without around and seconds_before"
 
 
 _RELATIVE: Final = re.compile(r"-.*|.*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
@@ -223,9 +224,9 @@ def _check_label(value: str) -> str:
     return value
 
 
-def _check_most(most: float, seconds: float) -> float:
+def _check_most(most: float, seconds: float, advice: str = "") -> float:
     if seconds > most:
-        raise ValueError(f"is more than {most:g}")
+        raise ValueError(f"is more than {most:g}{advice}")
     return seconds
 
 
@@ -463,7 +464,7 @@ class RecapTime(TimeArgument):
     )
     before_s: Annotated[
         _Positive,
-        AfterValidator(partial(_check_most, LONGEST_REASON_S)),
+        AfterValidator(partial(_check_most, LONGEST_REASON_S, advice=_FOR_LONGER)),
         Field(description="How far before it."),
     ] = Field(default=10, alias="seconds_before")
 

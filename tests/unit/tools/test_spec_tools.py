@@ -131,6 +131,13 @@ def test_all_faults_are_told_at_once() -> None:
     assert "max_samples was 0; expected a whole number of at least 1 and at most 10000" in reply
 
 
+def test_a_time_before_that_is_too_long_is_answered_with_how_to_ask_for_it() -> None:
+    assert refusal("recap", around=1784023200, seconds_before=600).startswith(
+        "seconds_before was 600, which is more than 60: for a longer time give start and end, "
+        "without around and seconds_before; expected"
+    )
+
+
 @pytest.mark.parametrize("value", [1784023200500, 1784023200500000000])
 def test_milliseconds_and_nanoseconds_are_recognised(value: int) -> None:
     reply = refusal("get_position_at", timestamp=value)
