@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from yaml import YAMLError
 
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.text import listed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -127,6 +128,9 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
         section = key.partition(".")[0]
         is_without_keys = keys == ["_target_"]
         known = f"unknown key; use one of: {', '.join(keys)}"
+        others = [*_keys_named(str(fault["loc"][-1]), model)]
+        if others:
+            known += f"; {listed(others)} {'is a key' if len(others) == 1 else 'are keys'}"
         return f"{key}: {_WITHOUT_KEYS[section] if is_without_keys else known}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
@@ -145,6 +149,16 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
     if isinstance(context.get("error"), OpenSecretError):
         return f"{key}: its value is not allowed, and not shown; {rule}"
     return f"{key}: {_cut_repr(fault['input'])} is not allowed; {rule}"
+
+
+def _keys_named(name: str, model: type, section: str = "") -> Iterator[str]:
+    """Yields the dot-paths of keys with a name in a section and all below it."""
+    for key, kind in get_type_hints(model).items():
+        path = f"{section}{key}"
+        if key == name:
+            yield path
+        if isinstance(kind, type) and is_dataclass(kind):
+            yield from _keys_named(name, kind, f"{path}.")
 
 
 def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> list[str]:
