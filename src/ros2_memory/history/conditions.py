@@ -65,13 +65,11 @@ def condition_of(view: View, sought: Sought) -> Condition:
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
+    field = field and field.strip()
     if field and type_name:
-        field = view.extractor.own_path(field.strip(), type_name)
+        field = view.extractor.own_path(field, type_name)
         value = level_number(value, field, type_name)
-    numbers = {}
-    if field:
-        field = field.strip()
-        numbers = {name: constant_number(view, value, field, name) for name in sorted(types)}
+    numbers = {name: constant_number(view, value, field, name) for name in sorted(types) if field}
     if len({*map(repr, numbers.values())}) == 1:
         [value, *_] = numbers.values()
     try:

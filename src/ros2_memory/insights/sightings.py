@@ -517,13 +517,14 @@ def _sighting(
     if robot is None and robot_at_first:
         # A recording may begin with the match, and have its first pose only after it.
         robot, robot_at_first = robot_at(view, run.last, newest_recording, frame_id), False
+    until = run.last
+    if thing is None:
+        until = _lasted_until(view, run, scope, is_flag=_is_flag(condition))
     return Sighting(
         topic=run.topic,
         first=run.first,
         last=run.last,
-        until=run.last
-        if thing is not None
-        else _lasted_until(view, run, scope, is_flag=_is_flag(condition)),
+        until=until,
         messages=run.messages,
         begun=run.begun > 0,
         robot=robot,

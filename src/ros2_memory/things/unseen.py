@@ -575,8 +575,8 @@ def _silence_notes(view: View, known: KnownThings, question: ThingsQuestion) -> 
     topics = [topic for topic in known.estimate.topics if topic not in question.undecoded]
     # Each new message of a detector is a look.
     is_empty = not ((looks.first < window.stop) & (looks.last >= window.start)).any()
-    is_empty &= not [*blind_notes(known, (window,))]
-    if topics and is_empty and known.reaches_back(window):
+    is_blind = any(True for _ in blind_notes(known, (window,)))
+    if topics and is_empty and not is_blind and known.reaches_back(window):
         yield (
             f"{listed(topics)} published nothing new in this window: whether things were there "
             "is not known"
