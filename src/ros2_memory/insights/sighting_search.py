@@ -170,7 +170,7 @@ class _TopicRuns:
         self._by_node: dict[int, _NodeRuns] = defaultdict(new_runs)
         self._waiting: list[Tested] = []
         self._messages = 0
-        # Blocks without a match that are older than all that were added, the newest first.
+        # Blocks without a match that follow the next older one before a silence, the newest first.
         self._skipped: list[Block] = []
 
     def tables(self, *, cut: bool) -> list[Ints]:
@@ -180,16 +180,16 @@ class _TopicRuns:
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
-        if not block.has_match and not self._is_open():
-            self._skipped.append(block)
-            return
-        # What follows the matches of this block before a silence ends their runs.
+        # What follows this block before a silence ends the runs in it.
         near = [newer for newer in self._skipped if newer.first - block.last <= SILENCE_NS]
-        self._skipped = []
-        for tested in [found.tested() for found in (*near, block)]:
+        self._skipped = [*near, block]
+        if not block.has_match and not self._is_open():
+            return
+        for tested in [skipped.tested() for skipped in self._skipped]:
             # One by one, many small blocks take long.
             self._waiting.append(tested)
             self._messages += tested.times.size
+        self._skipped = []
         if self._messages >= _MOST_WAITING:
             self._join()
 
