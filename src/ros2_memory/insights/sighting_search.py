@@ -200,7 +200,7 @@ class _TopicRuns:
 
     def _join(self) -> None:
         """Joins the messages of blocks that wait to the runs of their nodes."""
-        if not self._messages:
+        if not self._waiting:
             return
         tested = stacked(self._waiting[::-1])
         self._waiting, self._messages = [], 0
