@@ -424,7 +424,7 @@ def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> Stor
 def _notes_on_texts(view: View, topics: Sequence[str]) -> Iterator[str]:
     """Yields a note if rare texts, as of a mission's states, count as long as their messages."""
     for topic in topics:
-        if is_text(view, topic) and not is_latched(view, topic) and holds_on(view, [topic]):
+        if _is_said_once(view, topic):
             yield (
                 f"a text on {topic} counts for the moment in which it was said: changes, and by "
                 "value, of get_topic_in_range have for how long each held until the next one"
@@ -491,6 +491,19 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
     return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
 
 
+def _is_ended(view: View, run: Run, until: Ns) -> bool:
+    """Returns whether a message ended a state at a log time, or it is of a moment alone."""
+    if view.timeline.is_log(run.topic) or _is_said_once(view, run.topic):
+        return True
+    at = TimeWindow(until, until + 1)
+    return until > run.last and view.stream.first([run.topic], at) is not None
+
+
+def _is_said_once(view: View, topic: str) -> bool:
+    """Returns whether a topic has rare texts, each of which counts for its moment."""
+    return is_text(view, topic) and not is_latched(view, topic) and holds_on(view, [topic])
+
+
 def _sighting(
     view: View,
     condition: Condition,
@@ -517,9 +530,10 @@ def _sighting(
     if robot is None and robot_at_first:
         # A recording may begin with the match, and have its first pose only after it.
         robot, robot_at_first = robot_at(view, run.last, newest_recording, frame_id), False
-    until = run.last
+    until, ended = run.last, True
     if thing is None:
         until = _lasted_until(view, run, scope, is_flag=_is_flag(condition))
+        ended = _is_ended(view, run, until)
     return Sighting(
         topic=run.topic,
         first=run.first,
@@ -537,6 +551,7 @@ def _sighting(
         ),
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
+        ended=ended,
     )
 
 
@@ -585,6 +600,7 @@ def _goal_sighting(
         robot=robot,
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
+        ended=goal.ended is not None,
     )
     return sighting, message
 

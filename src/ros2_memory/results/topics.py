@@ -276,6 +276,7 @@ def _other_topic(topic: str, scope: Scope) -> JsonValue | Absent:
     OBJECT("place", "thing").if_known,
     digits(3)("score").if_known,
     PLAIN("began_earlier").if_any,
+    PLAIN("ended").when("goes_on"),
     SAID,
 )
 class Sighting:
@@ -299,6 +300,8 @@ class Sighting:
         skipped: how much of the time from `first` to `until` the clock skipped.
         robot_at_first: whether `robot` is of the first message.
         said: values of another topic meanwhile; None if they were not asked for.
+        ended: whether a message ended it at `until`; also True for a thing, a line of a log, and a
+            rare text, which are of the moments of their messages.
     """
 
     topic: str
@@ -315,6 +318,7 @@ class Sighting:
     skipped: Ns = 0
     robot_at_first: bool = False
     said: tuple[Spell, ...] | None = None
+    ended: bool = True
 
     @property
     def robot_time_key(self) -> str:
@@ -325,6 +329,11 @@ class Sighting:
     def began_earlier(self) -> bool:
         """Whether the sighting may have begun before its first message."""
         return not self.begun
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether no message ended it at `until`."""
+        return not self.ended
 
 
 @result(

@@ -776,6 +776,26 @@ def test_a_latched_value_that_is_said_again_is_one_sighting(tmp_path: Path, reca
 
 
 @each_way
+@pytest.mark.parametrize("every_s", [1, 60])
+def test_a_state_that_no_message_ended_is_marked_as_its_value_is_in_changes(
+    tmp_path: Path, recalls: bool, every_s: int
+) -> None:
+    """A crash, with the robot out of its dock since 180 s."""
+    docked = [boolean(BEGIN + at * S, at in {60, 120}, "/docked") for at in range(0, 300, every_s)]
+    memory = remembered(tmp_path, [*docked, odom(BEGIN + 300 * S)], recalls=recalls)
+    undocked = {"topic": "/docked", "condition_type": "equals", "value": False}
+    last, *_, first = asked(memory, "find_matches", **undocked, limit=9)["sightings"]
+    assert (last["ended"], "ended" in first) == (False, False)
+    changes = asked(
+        memory, "get_topic_in_range", topic="/docked", changes=True, start=T0, end=T0 + 300
+    )["changes"]
+    assert (changes[-1]["ended"], "ended" in changes[0]) == (False, False)
+    window = {"start": T0, "end": T0 + 30}
+    [cut] = asked(memory, "find_matches", **undocked, **window)["sightings"]
+    assert cut["ended"] is False, "it lasts longer than the window"
+
+
+@each_way
 @pytest.mark.parametrize(("begun_s", "rooms"), [(19, ["Hall", "Study"]), (19.5, ["Hall"])])
 def test_with_has_what_held_up_to_the_last_message_that_repeats_a_state(
     tmp_path: Path, recalls: bool, begun_s: float, rooms: list[str]
