@@ -240,10 +240,25 @@ def _holds_over_runs(view: View, topic: str) -> bool:
 
 def _has_message_of_run(view: View, topic: str, at: Ns) -> bool:
     """Returns whether a topic has a message of the recorder's run at a moment, up to then."""
+    return any(view.timeline.extents(topic, TimeWindow(_begin_of_run(view, at), at + 1)))
+
+
+def is_first_of_run(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether a topic had no message in the recorder's run before a message at a moment.
+
+    And whether that is no message of those that the recorder receives as it begins.
+    """
+    begun, earliest = _begin_of_run(view, at), view.snapshot.earliest
+    if earliest is None or at - max(begun, earliest) <= _RECEIVED_NS:
+        return False
+    return not any(view.timeline.extents(topic, TimeWindow(begun, at)))
+
+
+def _begin_of_run(view: View, at: Ns) -> Ns:
+    """Returns when the recorder's run at a moment began (ns); `MIN_NS` of the first one."""
     breaks = view.snapshot.breaks
     nth = bisect_right(breaks, at, key=itemgetter(1)) - 1
-    begun = breaks[nth][1] if nth >= 0 else MIN_NS
-    return any(view.timeline.extents(topic, TimeWindow(begun, at + 1)))
+    return breaks[nth][1] if nth >= 0 else MIN_NS
 
 
 def _command_topic(view: View) -> str:

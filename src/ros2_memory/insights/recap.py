@@ -36,13 +36,14 @@ from ros2_memory.history.coverage import (
     seconds,
     unexcluded,
 )
-from ros2_memory.history.held_values import breaks_of, is_latched
+from ros2_memory.history.held_values import breaks_of, deletions, is_latched
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
     ChangesBefore,
     changes_in,
     firsts_of_runs,
+    is_first_of_run,
     recap_before,
 )
 from ros2_memory.insights.drive import Drive, drive_in
@@ -384,7 +385,8 @@ def _reported_events(
             # What is received as the recorder begins became so before.
             is_held = is_latched(view, topic)
             firsts = firsts_of_runs(view, topic, window) if is_held else frozenset()
-            flips = _flip_events(topic, toggles, _ends_of_holding(view, topic, window))
+            begun = _true_since_first_message(view, topic, topic_events)
+            flips = _flip_events(topic, toggles, _ends_of_holding(view, topic, window), begun)
             events += (flip for flip in flips if flip.start not in firsts)
         errors = _errors_in_region(view, topic, topic_events, region_stays)
         events += [_error_event(error) for error in errors]
@@ -413,6 +415,18 @@ def _toggles(view: View, topic: str, events: TopicEvents) -> list[Change]:
         if flag.name in before and before[flag.name] != bool(flag.first)
     ]
     return [*first, *toggles]
+
+
+def _true_since_first_message(view: View, topic: str, events: TopicEvents) -> dict[str, Ns]:
+    """Returns since when booleans are true of which the first message of a recording says so.
+
+    Empty if that is as the recording begins: they may have been true for long.
+    """
+    flags, _ = events.of_kind(FLAG)
+    begun = {flag.name: flag.at for flag in flags if flag.first and flag.at == events.first}
+    if not begun or not is_first_of_run(view, topic, events.first) or deletions(view, topic):
+        return {}
+    return begun
 
 
 class _ThingsInView(NamedTuple):
@@ -570,10 +584,13 @@ def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     return Event(kind, goal.accepted, goal.last, text)
 
 
-def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
+def _flip_events(
+    topic: str, toggles: Sequence[Change], ends: Sequence[Ns], begun: Mapping[str, Ns]
+) -> Iterator[Event]:
     """Yields toggles with how long their values are known to hold.
 
     That is until the next toggle, or until one of `ends` (ns, in order); else beyond the window.
+    `begun` has since when (ns) booleans were true before their first toggle, if that is known.
     Booleans of a message that become the same, for as long, are one event.
     """
     next_toggle: dict[str, Ns] = {}
@@ -589,6 +606,11 @@ def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> I
         for together in toggled_together(reversed(ending_then)):
             text = toggle_sentence(topic, *together)
             at = together[0].time
+            # The last toggle that was met going back is the first one.
+            firsts = [flip.name for flip in together if next_toggle[flip.name] == at]
+            since = [begun[name] for name in firsts if name in begun]
+            if len(since) == len(together):
+                text += f", true since its first message {seconds(at - since[0])} before"
             yield Event("flip", at, end, text, goes_on=end is None, topic=topic)
 
 
@@ -651,7 +673,8 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
 
 def _boolean_of(event: Event) -> str:
     """Returns the sentence on a toggled boolean without its value; empty for another event."""
-    return event.text.rpartition(" ")[0] if event.kind == "flip" else ""
+    name, became, _ = event.text.partition(" became ")
+    return f"{name}{became.rstrip()}" if event.kind == "flip" else ""
 
 
 def _most_important(

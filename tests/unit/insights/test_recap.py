@@ -85,6 +85,32 @@ def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recall
 
 
 @each_way
+def test_a_boolean_that_is_true_in_its_first_message_says_how_long_it_was(
+    tmp_path: Path, recalls: bool
+) -> None:
+    poses = [odom(at(t), 0.4 * t) for t in range(60)]
+    flips = [(20, True), (21.2, False), (30, True), (31, False)]
+    cliff = [boolean(at(t), is_near, "/cliff") for t, is_near in flips]
+    # What is true as the recording begins may have been so for long.
+    docked = [boolean(at(t), t < 40, "/docked") for t in range(1, 60)]
+    write_splits(tmp_path, in_order([*poses, *cliff, *docked]))
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def flipped(begin: float, stop: float) -> list[str]:
+        events = asked(memory, "recap", start=T0 + begin, end=T0 + stop)["events"]
+        return [each["text"] for each in events if "became" in each["text"]]
+
+    assert flipped(0, 60) == [
+        "/cliff became false, true since its first message 1.2 s before",
+        "/cliff became true",
+        "/cliff became false",
+        "/docked became false",
+    ]
+    assert flipped(20.5, 29) == ["/cliff became false"]
+    assert flipped(29, 39) == ["/cliff became true", "/cliff became false"]
+
+
+@each_way
 def test_an_error_that_comes_again_long_after_is_another_event(
     tmp_path: Path, recalls: bool
 ) -> None:
