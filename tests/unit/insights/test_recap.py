@@ -725,6 +725,30 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
         assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
 
 
+@each_way
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_a_greatest_speed_that_a_gap_exceeds_has_a_note(
+    tmp_path: Path, recalls: bool, is_lost: bool
+) -> None:
+    """It stands, and while it is not localised for a minute it gets 6 m farther."""
+    stood = [odom(at(t / 5), 0.0) for t in range(150)]
+    lost = [odom(at(30 + t / 5), math.nan) for t in range(300) if is_lost]
+    later = [odom(at(90 + t / 5), 6.0) for t in range(50)]
+    memory = remembered(tmp_path, [*stood, *lost, *later], recalls=recalls)
+    note = "max_speed is of the time with poses alone: across gaps it was 0.10 m/s or more"
+    for tool in ("trajectory_summary", "recap"):
+        whole = asked(memory, tool, start=T0, end=T0 + 100)
+        assert whole["max_speed"] == 0.0
+        assert whole["gap_m"] == pytest.approx(6.0)
+        assert note in whole["notes"]
+        assert "max_speed" not in str(asked(memory, tool, start=T0, end=T0 + 29).get("notes"))
+    driven = [odom(at(t / 5), t / 10) for t in range(150)]
+    faster = remembered(
+        tmp_path / "faster", [*driven, *(odom(at(90 + t / 5), 21.0) for t in range(50))]
+    )
+    assert "across gaps" not in str(asked(faster, "recap", start=T0, end=T0 + 100)["notes"])
+
+
 def test_a_comparison_says_which_of_the_two_paths_has_a_gap(tmp_path: Path) -> None:
     legs = along_x(BEGIN, 30, mps=0.2, hz=10)
     legs += [odom(BEGIN + 60 * S + n * S // 10, 10.0 + n / 50) for n in range(300)]

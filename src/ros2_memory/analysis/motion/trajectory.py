@@ -70,6 +70,8 @@ _WIDEST_WANDER_M: Final = 0.3
 """Positions of one place at rest are no farther apart."""
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
+_SLOW_MPS: Final = 0.01
+"""The ends of a gap may be so far apart by noise alone, or by a correction of the map."""
 _BYTES: Final = 3000
 """About how much memory a slice takes without its vertices."""
 
@@ -385,6 +387,12 @@ def length_notes(path: Trajectory) -> Iterator[str]:
                 ": left out of distance_m, and of unknown length, as odometry may have begun anew"
             )
         yield f"{counted(totals.gaps, 'gap')} {without}{across}"
+        crossed_mps = mean_speed(path.gap_m or 0.0, totals.gap_ns / NS_PER_S)
+        if crossed_mps and path.max_speed is not None and crossed_mps > path.max_speed + _SLOW_MPS:
+            yield (
+                "max_speed is of the time with poses alone: across gaps it was "
+                f"{crossed_mps:.2f} m/s or more"
+            )
     if totals.jumps:
         yield (
             f"{counted(totals.jumps, 'jump')} of {totals.jumped_m:.2f} m in all, faster than is "
