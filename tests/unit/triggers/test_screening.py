@@ -75,6 +75,19 @@ def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
     assert bags.seconds() == halves(0, 6)
 
 
+def test_a_split_is_held_back_while_a_late_message_may_exclude_its_end(tmp_path: Path) -> None:
+    """Messages come up to a second late, and a margin of a second before them is excluded."""
+    bags = ScreenedBags(tmp_path / "bags", privacy(), privacy(name="without margin", margin=0))
+    name = bags.begin(0)
+    bags.split(name, [off(-2), *words(0, 10)])
+    bags.split(name, words(10, 12))
+    bags.step()
+    assert bags.seconds() == []
+    bags.split(name, [on(10.5), word(11.6)])
+    bags.step()
+    assert bags.seconds() == halves(0, 9)
+
+
 @pytest.mark.parametrize(
     ("said", "problem"),
     [
