@@ -9,14 +9,10 @@ from typing import Any
 import httpx2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
 from ros2_memory.analysis import topic_events
-from ros2_memory.analysis.motion.robot_track import cut_track, track_of
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -435,33 +431,3 @@ def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     assert 100 < len(found["x"]) <= 400
     drawn = np.column_stack([found["x"], found["y"]])
     assert off_line(drawn, poses, found["begins"]).max() <= 0.004
-
-
-paths = st.lists(
-    st.tuples(st.integers(1, 20), st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=60
-)
-
-
-def columns(steps: list[tuple[int, float, float]]) -> tuple[NDArray[np.int64], Any, Any]:
-    times = BEGIN + np.cumsum([each[0] for each in steps]) * S
-    return times, np.array([each[1] for each in steps]), np.array([each[2] for each in steps])
-
-
-@given(paths, st.integers(-5, 400), st.integers(1, 400))
-def test_a_track_that_is_cut_is_where_the_whole_one_is(
-    steps: list[tuple[int, float, float]], start: int, length: int
-) -> None:
-    times, x, y = columns(steps)
-    track = track_of(times, x, y, np.zeros(len(times)))
-    window = TimeWindow(BEGIN + start * S, BEGIN + (start + length) * S)
-    found = cut_track(track, window)
-    assert np.all((found.times >= window.start) & (found.times < window.stop))
-    assert np.all(np.diff(found.times) > 0)
-    inside = (track.times >= window.start) & (track.times < window.stop)
-    assert set(track.times[inside]) <= set(found.times.tolist())
-    for at, found_x in zip(found.times.tolist(), found.x.tolist(), strict=True):
-        seconds = (track.times - BEGIN) / S
-        assert found_x == pytest.approx(np.interp((at - BEGIN) / S, seconds, track.x), abs=1e-5)
-    # It goes up to an end of the window only where the robot was seen on both sides of that.
-    if len(found.times) and not found.begins[0]:
-        assert found.times[0] == window.start

@@ -328,16 +328,16 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
 
 
 def cut_track(track: RobotTrack, window: TimeWindow) -> RobotTrack:
-    """Returns a track in a window, with a vertex at each end of the window that it crosses.
+    """Returns a whole track in a window, with a vertex at each end of the window that it crosses.
 
-    A vertex at the start of the window does not begin a piece.
+    A vertex that is added at the start of the window does not begin a piece.
     """
     times = track.times
     first, last = np.searchsorted(times, (window.start, window.stop)).tolist()
     at, begins = times[first:last], track.begins[first:last]
-    if 0 < first < len(times) and not track.begins[first] and window.start < times[first]:
+    if first < len(times) and not track.begins[first] and window.start < times[first]:
         at, begins = np.append(window.start, at), np.append(False, begins)
-    if 0 < last < len(times) and not track.begins[last] and at[-1:].tolist() != [window.stop - 1]:
+    if last < len(times) and not track.begins[last] and at[-1:].tolist() != [window.stop - 1]:
         at, begins = np.append(at, window.stop - 1), np.append(begins, False)
     places = track.at(at) if at.size else (track.x[:0], track.y[:0], track.heading[:0])
     return RobotTrack(at, *places, begins, track.fastest_mps)

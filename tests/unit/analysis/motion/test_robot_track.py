@@ -1,7 +1,8 @@
 """The track of the robot: few vertices, and near every pose at its time."""
 
 import math
-from itertools import pairwise
+from dataclasses import replace
+from itertools import combinations_with_replacement, pairwise
 from random import Random
 from typing import Any
 
@@ -16,6 +17,7 @@ from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_RAD,
     PartialTrack,
     RobotTrack,
+    cut_track,
     joined_tracks,
     partial_track,
     settled_tracks,
@@ -23,6 +25,7 @@ from ros2_memory.analysis.motion.robot_track import (
     track_by,
     track_of,
 )
+from ros2_memory.core.model import TimeWindow
 from tests.support.examples import examples
 
 MS = 10**6
@@ -93,3 +96,39 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     middle = len(parts) // 2
     stretches = [*settled_tracks(parts[:middle]), *settled_tracks(parts[middle:])]
     assert same(track_by(*joined_tracks([stretches])), whole)
+
+
+METRES = st.floats(-50, 50)
+STEPS = st.tuples(st.integers(1, 20), METRES, METRES, st.floats(-1.5, 1.5))
+"""Seconds since the pose before, x, y and heading."""
+
+
+@given(st.lists(STEPS, max_size=6))
+def test_a_track_that_is_cut_is_where_the_whole_one_is(
+    steps: list[tuple[int, float, float, float]],
+) -> None:
+    """In every window whose first and last time are at, just beside or between vertices."""
+    rows = np.array(steps).reshape(-1, 4)
+    times = START + np.cumsum(rows[:, 0]).astype(np.int64) * S
+    track = replace(track_of(times, rows[:, 1], rows[:, 2], rows[:, 3]), fastest_mps=2.0)
+    vertices = track.times.tolist()
+    ends = [at + by for at in vertices for by in (-1, 0, 1, S // 2)] or [START]
+    for first, last in combinations_with_replacement(ends, 2):
+        found = cut_track(track, TimeWindow(first, last + 1))
+        assert found.times.tolist() == times_inside(track, first, last)
+        begins = track.pieces[0].tolist()
+        assert found.times[found.begins].tolist() == [at for at in begins if first <= at <= last]
+        assert found.fastest_mps == track.fastest_mps
+        for name in ("x", "y", "heading"):
+            whole = getattr(track, name)
+            at_s, vertex_s = (found.times - START) / S, (track.times - START) / S
+            expected = np.interp(at_s, vertex_s, whole) if len(whole) else whole
+            assert getattr(found, name) == pytest.approx(expected, abs=1e-5)
+
+
+def times_inside(track: RobotTrack, first: int, last: int) -> list[int]:
+    """The vertices from the first to the last time, and these two where a piece has them."""
+    vertices = {at for at in track.times.tolist() if first <= at <= last}
+    pieces = [*zip(*track.pieces, strict=True)]
+    ends = {end for end in (first, last) if any(begin <= end <= stop for begin, stop in pieces)}
+    return sorted(vertices | ends)
