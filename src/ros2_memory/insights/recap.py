@@ -684,7 +684,7 @@ def _most_important(
 
     What happens on any day comes last, the rare before the frequent: two changes of an emergency
     stop, then the stops, then a door that opens all the time. `counts` has how many there are of
-    each kind; there may be more than `events`. A note says how many are left out.
+    each kind; there may be more than `events`. A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))
 
@@ -693,6 +693,8 @@ def _most_important(
         lasted = (event.end or event.start) - event.start
         return min(kind, _OF_ANY_DAY), often, kind, -lasted
 
+    if counts.total() == len(events) == most + 1:
+        most += 1
     shown = sorted(events, key=rank)[:most]
     left_out = counts - Counter(event.kind for event in shown)
     if left_out:

@@ -220,6 +220,16 @@ def test_booleans_of_one_message_that_become_the_same_are_one_event(tmp_path: Pa
     ]
 
 
+@pytest.mark.parametrize("more", [1, 2])
+def test_one_event_too_many_is_listed_and_two_are_counted(tmp_path: Path, more: int) -> None:
+    toggles = MOST_EVENTS + more
+    door = [boolean(BEGIN + at * S, at % 2 == 1, topic="/door") for at in range(toggles + 1)]
+    told = over(remembered(tmp_path, door), 0, toggles)
+    assert dict(told.counts) == {"on/off changes": toggles}
+    is_noted = "left out, because there are too many" in str(told.notes)
+    assert (len(told.events), is_noted) == ((toggles, False) if more == 1 else (MOST_EVENTS, True))
+
+
 def test_of_many_stops_and_toggles_the_rare_are_listed_first(tmp_path: Path) -> None:
     """Stands for 5 s 34 times; a door opens and closes 40 times, an emergency stop is set once."""
     messages = []
