@@ -442,13 +442,13 @@ class MemoryDays:
         """Yields the messages of a bag; damaged ones are left out.
 
         Raises:
-            BagError: the disk fails to read the bag, and may recover.
+            BagUnreachableError: the disk fails to read the bag, and may recover.
         """
         for record in errors_as_items(self.reader.records(path, topics, _EVERYTHING)):
-            if not isinstance(record, BagError):
+            if isinstance(record, BagError):
+                self._lose(path, record)
+            else:
                 yield record
-            elif self._failing.may_recover(path, record):
-                raise record
 
     def _tables(self, path: Path) -> Iterator[Table]:
         """Yields the messages of a bag as tables; damaged ones are left out.
@@ -457,12 +457,20 @@ class MemoryDays:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
         for group in errors_as_items(undecoded(self.reader, path, skip_undecodable=True)):
-            if not isinstance(group, BagError):
-                yield from group.tables()
-            elif self._failing.may_recover(path, group):
-                raise group
+            if isinstance(group, BagError):
+                self._lose(path, group)
             else:
-                _log.warning("memory_not_read", path=str(path), reason=group.reason)
+                yield from group.tables()
+
+    def _lose(self, path: Path, error: BagError) -> None:
+        """Logs what cannot be read of a bag, and so does not stay.
+
+        Raises:
+            BagUnreachableError: the disk fails to read the bag, and may recover.
+        """
+        if self._failing.may_recover(path, error):
+            raise error
+        _log.warning("memory_not_read", path=str(path), reason=error.reason)
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
         """Returns a message without people whose label may not stay.

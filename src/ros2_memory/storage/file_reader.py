@@ -206,6 +206,9 @@ class FileReader(BagReader):
     def is_finished(self, path: Path) -> bool:
         """Checks closing magic for MCAP, journals beside a `.db3`, whole frames for `.zstd`."""
         with reading(path):
+            if _format_of(path) not in self._formats:
+                with OpenFile(path):
+                    return True
             if path.suffix == COMPRESSED:
                 return is_finished_zstd(path)
             return self._formats[path.suffix].is_finished(path)

@@ -873,8 +873,11 @@ def test_what_the_disk_does_not_give_holds_others_for_two_days_and_stays_if_it_c
         assert bags_left(bag_dir, "rec_[AC]") == 2
         assert not days_in(bag_dir)
         # A day for its latched messages, then one for what stays of it.
-        for clock.at in range(0, 172_802 * S if is_lasting else 1, 3600 * S):
-            keeper.apply()
+        with capture_logs() as logs:
+            for clock.at in range(0, 172_802 * S if is_lasting else 1, 3600 * S):
+                keeper.apply()
+    lost = {entry["path"] for entry in logs if entry["event"] == "memory_not_read"}
+    assert bool(lost) is is_lasting
     keeper.apply()
     assert not bags_left(bag_dir, "rec_[AC]")
     [day] = bag_dir.glob("memory/*.mcap")

@@ -189,6 +189,11 @@ def test_what_is_gone_has_vanished_and_what_is_no_bag_is_closed_and_its_fault_re
     for error in refusals(reader, path):
         assert not isinstance(error, BagVanishedError)
         assert error.reason
+    other = tmp_path / "notes.txt"
+    with pytest.raises(BagVanishedError):
+        reader.is_finished(other)
+    other.touch()
+    assert reader.is_finished(other)
     path.write_bytes(b"")
     assert not reader.is_finished(path)
     with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
