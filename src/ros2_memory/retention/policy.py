@@ -17,7 +17,8 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
   and nothing distinguishes the two. It separates two periods; a bag ages only against its own.
 - Where no bag is believed, as in simulated time, all are dated by their files.
 - Nothing is older than what was recorded before it: a bag that is dated before the newest of an
-  earlier recording has a wrong date, and counts as recorded with the next that has a right one.
+  earlier recording has a wrong date, and counts as recorded with the next that has a right one,
+  in its own recording or a later one.
   In the same way, no more was recorded after a recording than after one that was listed before it.
 
 The budget deletes the oldest first. The recorder's recordings are in the order in which they were
@@ -31,10 +32,12 @@ well, goes last. The newest bag always stays.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import accumulate
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+from ros2_memory.bag_dir.layout import split_number
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_DAY, NS_PER_HOUR, Ns
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 
@@ -339,11 +342,9 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
             newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     newest_in_order = [newest.get(name, MIN_NS) for name in names]
     earliest = dict(zip(names, accumulate([MIN_NS, *newest_in_order], max), strict=False))
-    replacements = _replacement_dates(names, newest, earliest)
+    replacements = _replacement_dates(contents, credible, earliest)
     bags = [
-        bag.dated(replacements[bag.recording])
-        if bag.date < earliest.get(bag.recording, MIN_NS)
-        else bag
+        bag.dated(replacements[bag.path]) if bag.path in replacements else bag
         for bag in contents.bags
     ]
     return replace(
@@ -352,20 +353,34 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
 
 
 def _replacement_dates(
-    names: Sequence[str], newest: Mapping[str, Ns], earliest: Mapping[str, Ns]
+    contents: DirContents, credible: Sequence[StoredBag], earliest: Mapping[str, Ns]
 ) -> dict[str, Ns]:
-    """Returns the date for the wrongly dated bags of each recording.
+    """Returns the dates of the wrongly dated bags, by path.
 
-    It is the newest date of this recording, or of the next one that is not dated before `earliest`;
-    if there is none, the newest date of all.
+    Each is the date of the next recorded bag that is not dated before `earliest`; if there is none,
+    the newest date of all.
     """
+    wrong = [bag for bag in contents.bags if bag.date < earliest.get(bag.recording, MIN_NS)]
+    if not wrong:
+        return {}
+    wrong_paths = {bag.path for bag in wrong}
+    believed = [bag for bag in credible if bag.recording in contents.places]
+    right = [bag for bag in believed if bag.path not in wrong_paths]
     dates: dict[str, Ns] = {}
-    date = max(newest.values(), default=MIN_NS)
-    for name in reversed(names):
-        if name in newest and newest[name] >= earliest[name]:
-            date = newest[name]
-        dates[name] = date
+    date = max(bag.end for bag in believed)
+    recorded = sorted((*wrong, *right), key=partial(_recorded_order, places=contents.places))
+    for bag in reversed(recorded):
+        if bag.path in wrong_paths:
+            dates[bag.path] = date
+        else:
+            date = bag.end
     return dates
+
+
+def _recorded_order(bag: StoredBag, places: Mapping[str, int]) -> tuple[int, int, Ns]:
+    """Returns the sort key of a bag by when it was recorded: dates say least."""
+    number = split_number(bag.recording, bag.path.rpartition("/")[2])
+    return places[bag.recording], MAX_NS if number is None else number, bag.date
 
 
 def _never_rising(recorded_since: Mapping[str, Ns], names: Sequence[str]) -> dict[str, Ns]:

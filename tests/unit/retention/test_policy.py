@@ -125,6 +125,34 @@ def test_what_was_recorded_first_goes_first_whatever_its_clock_said(
         assert all_but_one == [f"r{n // 4}_{n % 4}" for n in range(11)]
 
 
+def set_back(begun: int, hours: int, *wrong: int) -> DirContents:
+    """A recording by a clock an hour ahead, and one that goes on for hours by the right clock.
+
+    By `wrong` hours of these, its clock was a year behind.
+    """
+    ahead = bag("r0_0.mcap", begun + HOUR, recording="r0")
+    later = [
+        bag(f"r1_{n}.mcap", begun + (n + 1) * HOUR // 2 - 365 * DAY * (n in wrong), recording="r1")
+        for n in range(2 * hours)
+    ]
+    held = contents(ahead, *later, now=begun + hours * HOUR)
+    return replace(held, places={"r0": 0, "r1": 1})
+
+
+def test_what_was_recorded_just_after_a_clock_was_set_back_ages_with_what_follows_it() -> None:
+    hours = 30 * 24
+    old = 2 * (hours - 168) - 1
+    expected = ["r0_0.mcap", *(f"r1_{n}.mcap" for n in range(old))]
+    assert names(expired(set_back(NOW, hours), LIMITS)) == expected
+
+
+def test_what_a_clock_that_fell_behind_dates_is_as_young_as_what_follows_it() -> None:
+    hours = 30 * 24
+    behind = range(2 * hours - 300, 2 * hours - 290)
+    going = names(expired(set_back(NOW, hours, *behind), LIMITS))
+    assert not {f"r1_{n}.mcap" for n in behind}.intersection(going)
+
+
 def test_bags_without_a_date_go_by_the_time_of_their_file() -> None:
     bags = [
         bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
