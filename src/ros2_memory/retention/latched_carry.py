@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
+_DISCOVERY_NS: Final[Ns] = 30 * NS_PER_S
+"""Publishers are found one after the other: for so long late messages may follow live ones."""
 _RECORDINGS: Final = "ros2_memory_recordings"
 _OFTEN: Final = "ros2_memory_often"
 
@@ -324,8 +326,8 @@ class Carrier:
     ) -> dict[MessageIdentity, Ns]:
         """Returns the late messages of kept bags, and their earliest log time.
 
-        Late messages come first in a recording, when its recorder has just subscribed. So only the
-        first kept bag of each recording is read.
+        Late messages come early in a recording, while its recorder finds the publishers. So only
+        the beginning of the first kept bag of each recording is read.
         """
         late: _LateMessages = {}
         for topic in topics:
@@ -347,10 +349,13 @@ class Carrier:
 
     def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:
         late: dict[MessageIdentity, Ns] = {}
+        stop = MAX_NS
         for record in self._records(path, (topic,)):
-            if record.log_time - record.publish_time <= RECEIVED_AGAIN_NS:
+            stop = min(stop, record.log_time + _DISCOVERY_NS)
+            if record.log_time >= stop:
                 break
-            late.setdefault(latched_message(record, ()).identity, record.log_time)
+            if record.log_time - record.publish_time > RECEIVED_AGAIN_NS:
+                late.setdefault(latched_message(record, ()).identity, record.log_time)
         return late
 
     def _write(self, records: Sequence[Record]) -> None:
