@@ -50,18 +50,20 @@ class Foreign(NamedTuple):
     """The bags that the recorder did not make, which retention neither counts nor deletes.
 
     `files` are the bags that answer queries, and `bag_bytes` is their size. `total_bytes` also has
-    the bags that cannot be read.
+    the bags that cannot be read; of these, `active` may still grow.
     """
 
     files: frozenset[str]
     bag_bytes: int
     total_bytes: int
+    active: tuple[Path, ...]
 
 
 class ForeignBags:
     """Measures the foreign bags of one bag directory. Thread-safe.
 
-    It measures again only if the index or the list of the recorder's recordings changed.
+    It lists them again only if the index or the list of the recorder's recordings changed, and
+    always measures those that may still grow.
     """
 
     def __init__(self, bag_dir: Path) -> None:
@@ -84,9 +86,11 @@ class ForeignBags:
         if foreign is None or key_before != key:
             foreign = self._measure(snapshot, frozenset(recording))
             self._measured = key, foreign
-        return foreign
+        active_bytes = sum(map(size_of, foreign.active))
+        return foreign._replace(total_bytes=foreign.total_bytes + active_bytes)
 
     def _measure(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
+        """Returns the foreign bags; `total_bytes` is without those that are active."""
         judge = cache(partial(self._judge, recording=recording))
 
         def is_foreign(file: str) -> bool:
@@ -100,10 +104,15 @@ class ForeignBags:
             if is_foreign(bag.file)
         }
         bag_bytes = total_bytes = sum(bags.values())
-        for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread):
-            if not aside.answers and is_foreign(str(aside.path)):
+        for aside in (*snapshot.damaged, *snapshot.unread):
+            if is_foreign(str(aside.path)):
                 total_bytes += size_of(aside.path)
-        return Foreign(frozenset(bags), bag_bytes, total_bytes)
+        active = tuple(
+            aside.path
+            for aside in snapshot.active
+            if not aside.answers and is_foreign(str(aside.path))
+        )
+        return Foreign(frozenset(bags), bag_bytes, total_bytes, active)
 
     def _judge(self, folder: str, recording: frozenset[str]) -> Callable[[str], bool]:
         """Returns a function that says whether a bag file of a directory counts in the budget."""

@@ -1,6 +1,7 @@
 """Bags that the recorder did not make are neither deleted, repaired nor counted in a limit."""
 
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import McapLayout, mcap_content, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.housekeepers import (
@@ -219,6 +220,24 @@ def test_status_and_health_say_how_much_foreign_bags_take(mixed: Mixed) -> None:
     loose.unlink()
     memory.index.refresh()
     assert memory_status(memory, Call()).budget.foreign == 0
+
+
+def test_a_foreign_bag_that_grows_is_measured_anew(tmp_path: Path) -> None:
+    recording(tmp_path, A, 0)
+    own_all(tmp_path)
+    messages = [odom(T0 + n * S // 10, 1.0, 2.0) for n in range(500)]
+    content = mcap_content(messages, McapLayout(finish=False, chunk_size=4096))
+    session = tmp_path / "session_mcap" / "session_0.mcap"
+    session.parent.mkdir()
+    memory = memory_in(tmp_path)
+    sizes = [len(content) * fifths // 5 for fifths in range(1, 6)]
+    reported = list[int | None]()
+    for size in sizes:
+        session.write_bytes(content[:size])
+        os.utime(session, ns=(NOW, NOW))
+        memory.index.refresh()
+        reported.append(memory_status(memory, Call()).budget.foreign)
+    assert reported == sizes
 
 
 def test_nothing_is_reported_where_it_is_not_known_or_does_not_matter(tmp_path: Path) -> None:
