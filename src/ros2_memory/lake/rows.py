@@ -375,23 +375,22 @@ class RowMaker:
                 undecodable += len(rows) - len(detected.log_times)
                 same = {"topic": topic, "type": rows.table.channel.type}
                 message = np.searchsorted(times, detected.log_times)
-                if len(rows) == len(detected.log_times):
-                    message += rows.ranks
+                message += rows.ranks[np.isin(rows.times, detected.log_times)]
                 sightings += self._sighting_rows(same, detected, message, frame, track)
         return sightings, undecodable
 
     def _detected(self, rows: Rows) -> Iterator[tuple[Rows, Detected]]:
-        """Yields rows with their detections; one by one if any is undecodable and some are tied.
+        """Yields rows with their detections; apart by rank if any is undecodable and some are tied.
 
-        Only then it shows which of the messages of one log time is undecodable.
+        Of messages of one log time only then it shows which is undecodable.
         """
-        detected = self._detections.read(rows)
-        if len(detected.log_times) == len(rows) or not rows.ranks.any():
+        detected, ranks = self._detections.read(rows), rows.ranks
+        if len(detected.log_times) == len(rows) or not ranks.any():
             yield rows, detected
             return
-        for row in np.arange(len(rows))[:, np.newaxis]:
-            alone = rows.some(row)
-            yield alone, self._detections.read(alone)
+        for rank in np.unique(ranks).tolist():
+            alike = rows.some(np.flatnonzero(ranks == rank))
+            yield alike, self._detections.read(alike)
 
     def _sighting_rows(
         self, same: Row, detected: Detected, message: IntArray, frame: str | None, track: RobotTrack
