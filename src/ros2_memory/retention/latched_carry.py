@@ -327,16 +327,19 @@ class Carrier:
         """Returns the late messages of kept bags, and their earliest log time.
 
         Late messages come early in a recording, while its recorder finds the publishers. So only
-        the beginning of the first kept bag of each recording is read.
+        the beginning of what is kept of each recording is read, which short splits divide.
         """
         late: _LateMessages = {}
         for topic in topics:
-            first_bags: dict[Path, BagFile] = {}
+            begun: dict[Path, Ns] = {}
+            early: list[BagFile] = []
             for bag in snapshot.bags:
                 is_kept = bag.file not in to_delete and not is_derived(bag.file)
                 if is_kept and topic in bag.summary.schema.positions:
-                    first_bags.setdefault(bag.recording, bag)
-            for bag in first_bags.values():
+                    since = begun.setdefault(bag.recording, bag.start)
+                    if bag.start < since + _DISCOVERY_NS:
+                        early.append(bag)
+            for bag in early:
                 key = (bag.path, bag.mtime_ns, topic)
                 known = self._late.get(key)
                 late[key] = self._late_in(bag.path, topic) if known is None else known

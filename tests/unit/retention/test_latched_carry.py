@@ -261,18 +261,21 @@ def test_answers_about_latched_topics_are_the_same_after_as_before_a_deletion(
     assert answers() == before
 
 
+@pytest.mark.parametrize("is_split", [False, True])
 @pytest.mark.parametrize("others_s", [100, 120])
 def test_what_is_received_again_after_a_live_message_keeps_its_first_time(
-    tmp_path: Path, others_s: int
+    tmp_path: Path, others_s: int, is_split: bool
 ) -> None:
     recording(tmp_path, "rec", [docked(T0, "home"), docked(T0 + 5 * S, "shelf"), *drive_in(0)])
     live = docked(T0 + 100 * S, "door")
     again = docked(T0, "home", received=T0 + (others_s + 1) * S)
-    recording(tmp_path, "rez", [live, *drive(T0 + 100 * S, T0 + 140 * S), again])
+    driven = drive(T0 + 102 * S, T0 + 140 * S)
+    splits = [[live], [again, *driven]] if is_split else [[live, again, *driven]]
+    recording(tmp_path, "rez", *splits)
     memory = memory_of(tmp_path)
     moments = [T0 + second * S for second in (105, 130)]
     before = [held(memory, DOCK, moment) for moment in moments]
-    keep_only(tmp_path, "rez/rez_0.mcap")
+    keep_only(tmp_path, *(f"rez/rez_{number}.mcap" for number in range(len(splits))))
     assert [held(memory, DOCK, moment) for moment in moments] == before
 
 
