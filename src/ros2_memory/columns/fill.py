@@ -80,6 +80,11 @@ class Progress:
     waiting: int = 0
     refused: int = 0
 
+    @property
+    def percent(self) -> int:
+        """How many of a hundred closed bags are stored, rounded down."""
+        return 100 * self.stored // max(self.closed, 1)
+
 
 class Batch(NamedTuple):
     """Bags of one recording that are stored in the same parts.

@@ -292,11 +292,10 @@ class EpisodicServer(MCPServer[object]):
 
 
 def _describe_progress(progress: Progress) -> str | None:
-    """Returns e.g. `40 % of the bags stored`; None if all are."""
+    """Returns e.g. `40 % of the bags stored`; None if none waits."""
     if not progress.waiting:
         return None
-    done = progress.closed - progress.waiting
-    return f"{100 * done // max(progress.closed, 1)} % of the bags stored"
+    return f"{progress.percent} % of the bags stored"
 
 
 def _http_request(context: object) -> Request | None:

@@ -21,6 +21,7 @@ from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
+from ros2_memory.serving.mcp_server import _describe_progress
 from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.recordings import Recordings
@@ -135,11 +136,24 @@ def test_where_a_part_takes_too_long_the_others_are_shown(
         raise QueryTimeoutError("it takes too long")
 
     monkeypatch.setattr(span, "recap", slow)
-    found = shown(memory, "last=1000", progress=lambda: Progress(closed=3, waiting=2))
-    assert found["filling"] == {"closed": 3, "waiting": 2}
+    found = shown(memory, "last=1000", progress=lambda: Progress(closed=3, stored=1, waiting=2))
+    assert found["filling"] == {"closed": 3, "percent": 33}
     assert "events" not in found
     assert "the events are not known yet: it takes too long" in found["notes"]
     assert found["path"]["x"][-1] == 30.0
+
+
+@pytest.mark.parametrize(
+    ("progress", "percent"),
+    [(Progress(closed=0, waiting=1), 0), (Progress(closed=100, stored=0, waiting=50), 0)],
+)
+def test_a_bag_that_is_not_closed_makes_no_share_of_stored_bags_wrong(
+    memory: Memory, progress: Progress, percent: int
+) -> None:
+    """It waits to be stored, too: the share was -100 %, and 50 where none was stored."""
+    found = shown(memory, "last=1000", progress=lambda: progress)
+    assert found["filling"] == {"closed": progress.closed, "percent": percent}
+    assert _describe_progress(progress) == f"{percent} % of the bags stored"
 
 
 def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:

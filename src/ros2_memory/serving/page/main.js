@@ -417,9 +417,8 @@ function showRecordings(view) {
 function showFilling(filling) {
   at("filling").hidden = !filling;
   if (!filling) return;
-  const done = Math.floor(100 * (filling.closed - filling.waiting) / (filling.closed || 1));
-  at("filled").value = done;
-  at("filled-text").textContent = `Bags are being stored as columns: ${done} % of `
+  at("filled").value = filling.percent;
+  at("filled-text").textContent = `Bags are being stored as columns: ${filling.percent} % of `
     + `${counted(filling.closed, "bag")}. Until then answers take longer.`;
 }
 function showKey() {

@@ -297,7 +297,7 @@ def _filling_state(filling: Progress | None) -> JsonObject | None:
     # While recording, the newest of many bags are never stored yet.
     if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10):
         return None
-    return {"closed": filling.closed, "waiting": filling.waiting}
+    return {"closed": filling.closed, "percent": filling.percent}
 
 
 def _recorded_range(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
