@@ -441,8 +441,8 @@ def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:
     note_runs(view, resolve_path_topic(view), frame_id, window)
     if known.since is not None:
         view.notes.add_lack(
-            f"visits are known back to {unix_text(known.since)}: out of time before older "
-            "poses were placed"
+            f"where the robot was is known back to {unix_text(known.since)}: out of time before "
+            "older poses were placed"
         )
     if known.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
