@@ -13,8 +13,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import View
-from ros2_memory.places import robot_tracks
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
     Msg,
@@ -354,12 +354,11 @@ def test_a_reply_without_visits_says_since_when_it_is_known_where_the_robot_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = remembered(tmp_path, [odom(T0 + n * S, 0.1 * n) for n in range(600)])
-    read = robot_tracks.read_until_late
 
     def late(*given: Any) -> tuple[list[Any], int]:
-        return read(*given)[0], T0 + 300 * S
+        return read_until_late(*given)[0], T0 + 300 * S
 
-    monkeypatch.setattr(robot_tracks, "read_until_late", late)
+    monkeypatch.setattr("ros2_memory.places.robot_tracks.read_until_late", late)
     within, point = {"start": T0_S, "end": T0_S + 600}, {"x": 0.0, "y": 0.0}
     notes = str(asked(memory, "trajectory_summary", farthest_from=point, **within)["notes"])
     assert f"where the robot was is known back to {T0 // S + 300}" in notes
