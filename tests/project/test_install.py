@@ -13,7 +13,7 @@ import yaml
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import NullRecorderNode, Ros2BagNode, load_settings
-from ros2_memory.serving.auth import CREDENTIAL
+from ros2_memory.serving.given_tokens import CREDENTIAL
 from tests.support.bags import odom, write_db3
 from tests.support.housekeepers import state
 from tests.support.memories import ROOT

@@ -10,6 +10,7 @@ from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_given
 from ros2_memory.cli.output import filled_leaves, print_json, print_line
 from ros2_memory.config import files_in_use, plain_values
+from ros2_memory.serving.given_tokens import given_tokens
 
 _MASK: Final = "********"
 
@@ -33,6 +34,5 @@ def config_show(words: Words = None, bag_dir: BagDir = None, as_json: AsJson = F
     print_line(yaml.safe_dump(values, sort_keys=False, allow_unicode=True).rstrip())
     for path in files_in_use(settings):
         print_line(f"# in use: {path}")
-    for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
-        if os.environ.get(name):
-            print_line(f"# {name} is set: {_MASK}")
+    for source in given_tokens(os.environ):
+        print_line(f"# {source} is set: {_MASK}")

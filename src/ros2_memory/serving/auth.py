@@ -30,6 +30,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import LogThrottle, get_logger
+from ros2_memory.serving.given_tokens import CREDENTIAL, FILE_VARIABLE, VARIABLE, given_tokens
 from ros2_memory.serving.page import PAGE_PATH
 
 if TYPE_CHECKING:
@@ -44,10 +45,6 @@ MCP_PATH: Final = "/mcp"
 RECORDING_PATH: Final = "/health/recording"
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
-VARIABLE: Final = "MEMORY_API_TOKEN"
-FILE_VARIABLE: Final = "MEMORY_API_TOKEN_FILE"
-CREDENTIAL: Final = "memory_api_token"
-"""The name under which a systemd unit passes the token: `LoadCredential=memory_api_token:PATH`."""
 SHORTEST_TOKEN: Final = 16
 LONGEST_TOKEN: Final = 1024
 LOG_INTERVAL_S: Final = 60.0
@@ -288,14 +285,7 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     Raises:
         ConfigError: it cannot be read, is given twice, or cannot be sent in a header.
     """
-    given: dict[str, str | Path] = {}
-    if text := env.get(VARIABLE):
-        given[VARIABLE] = text
-    if file := env.get(FILE_VARIABLE):
-        given[FILE_VARIABLE] = Path(file)
-    credentials = env.get("CREDENTIALS_DIRECTORY")
-    if credentials and (path := Path(credentials) / CREDENTIAL).exists():
-        given[f"the credential {CREDENTIAL}"] = path
+    given = given_tokens(env)
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} both give the API token; leave one of them")
     for source, token in given.items():

@@ -422,6 +422,16 @@ def test_config_is_shown_as_yaml_that_a_program_would_take_but_no_token_is(
     assert "a-secret" not in text
 
 
+def test_config_shows_that_systemd_gives_the_token(
+    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    (tmp_path / "memory_api_token").write_text("a-secret-that-is-long-enough")
+    text = exits(0, "config show").out
+    assert "# the credential memory_api_token is set: " in text
+    assert "a-secret" not in text
+
+
 def test_without_v_no_warning_is_logged_and_with_it_the_events(
     folder: Path, exits: Program
 ) -> None:
