@@ -117,11 +117,10 @@ def find_things(
     if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
     shown = tuple(finder.describe(thing) for thing in found[:limit])
-    view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
     last_stays = _last_stays(found[:limit])
+    view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
     view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
-    movers = [(each.thing, each.rows) for each in found if isinstance(each.thing, Mover)]
-    view.notes.add(*lone_notes(known, movers))
+    view.notes.add(*lone_notes(known, _movers(found)))
     totals = _totals(found)
     question = ThingsQuestion(
         labels=wanted,
@@ -146,6 +145,15 @@ def find_things(
             *scatter_notes(last_stays),
         ),
     )
+
+
+def _movers(found: Iterable[_FoundThing]) -> list[tuple[Mover, Ints]]:
+    """Returns people and the like, each with its spots in the window."""
+    return [
+        (found_thing.thing, found_thing.rows)
+        for found_thing in found
+        if isinstance(found_thing.thing, Mover)
+    ]
 
 
 def _last_stays(found: Iterable[_FoundThing]) -> list[tuple[Instance, PlacedStay]]:
