@@ -30,7 +30,6 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import rounded_beside
 from ros2_memory.core.text import leaves as leaves_by_path
-from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
@@ -42,7 +41,7 @@ from ros2_memory.history.reverse_search import note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
-from ros2_memory.messages.conversions import Summary, single_values
+from ros2_memory.messages.conversions import Summary
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -559,25 +558,9 @@ def count_range(
             values = [None if cell is None else getattr(cell, column) for cell in cells]
             kind: BinColumn = "time" if column.endswith("_at") else "number"
             binned.add(f"{field}.{column}", kind, values, getattr(window_cell, column))
-    if not fields:
-        _note_number_fields(view, name, by, binned.counted.stop)
     note_robots(view, name, binned.counted)
     note_no_fix(view, name, binned.counted, names)
     return binned.answer()
-
-
-def _note_number_fields(view: View, topic: str, by: By, until: Ns) -> None:
-    """Notes which fields have numbers, by the newest message before a log time (ns)."""
-    newest = view.stream.last(topic, until)
-    value = None if newest is None else view.value(newest)
-    if not isinstance(value, dict):
-        return
-    names = [name for name, inner in single_values(value) if not isinstance(inner, str | bool)]
-    if names:
-        view.notes.add(
-            f"only messages are counted: with fields ({listed(names)}) there are the least, the "
-            f"greatest and the mean by {by}"
-        )
 
 
 def number_paths(view: View, topic: str, fields: Sequence[str], until: Ns) -> tuple[str, ...]:

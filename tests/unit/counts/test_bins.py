@@ -24,7 +24,6 @@ from tests.support.bags import (
     detected,
     detections,
     header,
-    in_order,
     log_entry,
     make,
     odom,
@@ -205,21 +204,6 @@ def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(tmp_path: Path
     assert sum(row["count"] for name, row in rows.items() if name != "all") > 1500
     assert rows["all"]["count"] == 1500
     assert "places overlap: what is in two of them counts to both" in reply["notes"]
-
-
-def test_counts_of_messages_alone_name_the_fields_whose_numbers_a_topic_has(tmp_path: Path) -> None:
-    moving = [odom(BEGIN + at * S, at, 1.0) for at in range(5)]
-    said = [boolean(BEGIN + at * S, True) for at in range(5)]
-    write_mcap(tmp_path / "run" / "run_0.mcap", in_order([*moving, *said]))
-    memory = memory_of(tmp_path)
-    span = {"start": BEGIN / S, "end": BEGIN / S + 4, "by": "day"}
-    named = "with fields (position.x, position.y, position.z and 9 more)"
-    assert named in str(asked(memory, "get_topic_in_range", topic="/odom", **span)["notes"])
-    of_field = asked(memory, "get_topic_in_range", topic="/odom", fields=["position.x"], **span)
-    assert table(of_field)["all"]["position.x.max"] == 4.0
-    assert "only messages are counted" not in str(of_field)
-    of_flags = asked(memory, "get_topic_in_range", topic="/bumper", **span)
-    assert "only messages are counted" not in str(of_flags)
 
 
 def test_the_first_of_a_day_is_not_known_where_the_window_begins_after_others(
