@@ -20,7 +20,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from ros2_memory import config, config_sources
-from ros2_memory.serving import auth
+from ros2_memory.serving import given_tokens
 from tests.support.memories import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -99,7 +99,7 @@ def test_no_dependency_may_reach_a_major_release_that_nobody_tried(
 
 
 def test_the_environment_example_names_every_variable_that_is_read_and_sets_none() -> None:
-    readers = (config.__file__, config_sources.__file__, auth.__file__)
+    readers = (config.__file__, config_sources.__file__, given_tokens.__file__)
     source = "".join(Path(file).read_text() for file in readers)
     lines = (ROOT / ".env.example").read_text().splitlines()
     named = {found[1] for line in lines if (found := re.match(r"#([A-Z_]+)=", line))}
