@@ -42,8 +42,8 @@ _REST_M: Final = 0.2
 _ALIKE: Final = 0.5
 """What wanders has steps from slot to slot in other directions: the mean cosine between two is
 less. Those of an averaged random walk have 0.2, and those of a straight drive 1."""
-_OF_STEPS: Final = 1.5
-"""The standard deviation of what wanders is taken for so many usual steps."""
+_STEPS_OF_DEVIATION: Final = 1.5
+"""The standard deviation of a position that wanders, in median steps from slot to slot."""
 
 
 class FrameCodes(NamedTuple):
@@ -95,7 +95,7 @@ class Poses:
         )
 
     def wander_m(self) -> Floats:
-        """Returns by how much (m) the position wanders at rest: 0 where the robot may move.
+        """Returns the standard deviation (m) of each position at rest; 0 where the robot may move.
 
         At rest, positions stay near for a while, and their steps lead in no direction.
         """
@@ -115,7 +115,7 @@ class Poses:
 
 
 def _slots_wander_m(slots: IntArray, means: Vectors) -> Floats:
-    """Returns by how much (m) the mean position of each slot wanders; see `Poses.wander_m`.
+    """Returns the standard deviation (m) of the position in each slot; see `Poses.wander_m`.
 
     Of the windows of slots around it that show no motion, the one with the longest steps counts.
     """
@@ -133,7 +133,9 @@ def _slots_wander_m(slots: IntArray, means: Vectors) -> Floats:
         & (sliding_window_view(cosines, _REST_SLOTS - 2).mean(axis=1) < _ALIKE)
     )
     medians = np.median(sliding_window_view(squares, _REST_SLOTS - 1), axis=1)
-    of_windows = np.pad(np.where(is_rest, _OF_STEPS * np.sqrt(medians), 0.0), _REST_SLOTS - 1)
+    of_windows = np.pad(
+        np.where(is_rest, _STEPS_OF_DEVIATION * np.sqrt(medians), 0.0), _REST_SLOTS - 1
+    )
     wander_m: Floats = sliding_window_view(of_windows, _REST_SLOTS).max(axis=1)
     return wander_m
 

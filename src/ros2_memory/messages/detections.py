@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 SCORES: Final = ("score", "confidence", "probability")
 HYPOTHESES: Final = ("results", "classification")
-"""Lists of what an object may be, in vision_msgs and in autoware_perception_msgs."""
+"""Fields with the possible classes of an object, in vision_msgs and autoware_perception_msgs."""
 NOT_LABELLED: Final = frozenset({"stride"})
 """An object with such a field is a std_msgs/MultiArrayDimension, whose label names an axis."""
 
@@ -245,7 +245,7 @@ def hypotheses_field(fields: Collection[str]) -> str | None:
 
 
 def lists_of_seen(fields: Mapping[str, object]) -> frozenset[str]:
-    """Returns under which of its fields an object may list the labels of what was seen."""
+    """Returns the fields in which an object may list labels of things that were seen."""
     is_beside = LOOKED_FOR in fields and any(
         isinstance(part, list | dict) and name != LOOKED_FOR and name not in _NO_CONTENT
         for name, part in fields.items()

@@ -326,8 +326,8 @@ class Carrier:
     ) -> dict[MessageIdentity, Ns]:
         """Returns the late messages of kept bags, and their earliest log time.
 
-        Late messages come early in a recording, while its recorder finds the publishers. So only
-        the beginning of what is kept of each recording is read, which short splits divide.
+        Late messages come while the recorder of a recording discovers the publishers. So of each
+        recording only the kept bags that begin within `_DISCOVERY_NS` of the first one are read.
         """
         late: _LateMessages = {}
         for topic in topics:

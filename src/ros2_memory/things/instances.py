@@ -158,7 +158,7 @@ class Tally(NamedTuple):
 
 
 class BlindTime(NamedTuple):
-    """A time [first, last] (ns) in which a detector saw nothing of what is usual in its view."""
+    """A time [first, last] (ns) in which a detector saw none of the usual things in its view."""
 
     topic: str
     first: Ns

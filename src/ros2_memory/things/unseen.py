@@ -430,8 +430,11 @@ def vague_notes(
 def lone_notes(known: KnownThings, movers: Iterable[tuple[Mover, Ints]]) -> Iterator[str]:
     """Yields which movers were last seen by a detection alone, and when before that.
 
-    Of what stays at a place such a detection does not count; a mover may be anywhere. Each comes
-    with its spots in a window.
+    A thing that stays needs several detections; a mover may be anywhere, so that one counts.
+
+    Args:
+        known: the things.
+        movers: each with the rows of its spots in a window.
     """
     estimate = known.estimate
     for mover, rows in movers:
