@@ -112,7 +112,8 @@ def find_things(
         found = [*nearness.select(found, landmarks)]
         view.notes.add(*nearness.describe_lack(memory.limits, found, landmarks))
         if nearness.label and not landmarks:
-            wanted[known.labels.key(nearness.label)] = nearness.label
+            # What was sought near it may well be a thing: nothing was looked for.
+            wanted = {known.labels.key(nearness.label): nearness.label}
     note_unread(view, asked_window, nothing=not found, gaps=not found)
     if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
