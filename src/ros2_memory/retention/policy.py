@@ -17,8 +17,8 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
   and nothing distinguishes the two. It separates two periods; a bag ages only against its own.
 - Where no bag is believed, as in simulated time, all are dated by their files.
 - Nothing is older than what was recorded before it: a bag that is dated before the newest of an
-  earlier recording has a wrong date, and counts as recorded with the next that has a right one,
-  in its own recording or a later one.
+  earlier recording, whose dates are not in doubt, has a wrong date, and counts as recorded with
+  the next that has a right one, in its own recording or a later one.
   In the same way, no more was recorded after a recording than after one that was listed before it.
 
 The budget deletes the oldest first. The recorder's recordings are in the order in which they were
@@ -327,7 +327,8 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
     """Returns the contents with dates and ages that agree with the order of the recordings.
 
     If no bag has a credible date, each one gets that of its file first. Then a bag dated before the
-    newest message of an earlier recording gets another date, see `_replacement_dates`.
+    newest message of an earlier recording that is not in doubt gets another date, see
+    `_replacement_dates`.
     """
     credible = _credibly_dated(contents, limits)
     if not credible:
@@ -336,9 +337,10 @@ def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> Di
     if not contents.places:
         return contents
     names = sorted(contents.places, key=contents.places.__getitem__)
+    sure = contents.places.keys() - contents.doubtful
     newest: dict[str, Ns] = {}
     for bag in credible:
-        if bag.recording in contents.places:
+        if bag.recording in sure:
             newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     newest_in_order = [newest.get(name, MIN_NS) for name in names]
     earliest = dict(zip(names, accumulate([MIN_NS, *newest_in_order], max), strict=False))
