@@ -186,30 +186,36 @@ _CUT: Final = (
 
 def describe_cut(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each reason why messages of a window were cut out of bags."""
-    return _count_losses(read_losses(bag_dir, window.start, window.stop), _CUT)
+    return _count_losses(read_losses(bag_dir, window.start, window.stop), _CUT, window)
 
 
 def _count_losses(
-    losses: Iterable[Loss], kinds: Iterable[tuple[str, Collection[str]]]
+    losses: Iterable[Loss], kinds: Iterable[tuple[str, Collection[str]]], window: TimeWindow
 ) -> Iterator[str]:
-    """Yields a sentence for each kind of loss: how many messages of which topics."""
+    """Yields a sentence for each kind of loss in a window: how many messages of which topics.
+
+    It has the times of losses that reach beyond the window: all of their messages are counted.
+    """
     for what, causes in kinds:
-        topics = Counter[str]()
+        topics, spans = Counter[str](), list[Span]()
         for loss in losses:
             if loss.by in causes:
                 topics[loss.topic] += loss.lost
+                spans.append((loss.start, loss.stop - 1))
         if topics:
+            span = enclosing(spans)
+            when = "" if window.covers(*span) else f" from {span_text(*span)}"
             most_first = sorted(topics.items(), key=lambda item: (-item[1], item[0]))
             named = listed([f"{topic} ({count})" for topic, count in most_first])
             lost = topics.total()
             they = "it was" if lost == 1 else "they were"
-            yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
+            yield f"{counted(lost, 'message')} {what.format(they=they)}{when}: {named}"
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each way in which messages of a window were lost."""
     losses = read_losses(bag_dir, window.start, window.stop)
-    yield from _count_losses(losses, _LOST)
+    yield from _count_losses(losses, _LOST, window)
     refused = defaultdict[str, Spans](list)
     for loss in losses:
         if loss.by == "refused":

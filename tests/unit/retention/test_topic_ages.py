@@ -109,6 +109,20 @@ def test_answers_say_that_it_was_deleted_and_count_it_and_metadata_what_is_left(
     assert "20 messages deleted by retention (retention.topics): /speech (20)" in status["notes"]
 
 
+def test_what_was_deleted_of_a_longer_time_than_asked_is_counted_with_that_time(
+    bag_dir: Path,
+) -> None:
+    for nth in (1, 2):
+        split(bag_dir, 0, name=f"rec_{nth}", first=nth * 10 * S)
+    own_all(bag_dir)
+    house(bag_dir).apply()
+    start = T0 / S
+    reply = reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=start, end=start + 5)
+    span = f"{start:.6f} to {start + 29:.6f} (29 s)"
+    deleted = f"30 messages deleted by retention (retention.topics) from {span}: /speech (30)"
+    assert deleted in reply["notes"]
+
+
 def test_a_topic_of_which_all_messages_were_deleted_is_not_said_to_be_unrecorded(
     bag_dir: Path,
 ) -> None:
