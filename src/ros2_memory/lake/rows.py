@@ -115,12 +115,16 @@ def sha256_of(path: Path) -> str:
 
 
 class _Derived(NamedTuple):
-    """What rows of bags that lie close together are made of; poses and events by file."""
+    """What rows of bags that lie close together are made of; all but things and detections by file.
+
+    `undecodable`: messages that cannot be decoded, of topics that may have detections.
+    """
 
     poses: Mapping[str, Poses]
     events: Mapping[str, Sequence[Row]]
     things: Mapping[BagFile, Sequence[Row]]
     detections: Mapping[BagFile, Mapping[str, Sequence[Rows]]]
+    undecodable: Mapping[str, int]
 
 
 @dataclass(eq=False, repr=False)
@@ -192,6 +196,7 @@ class RowMaker:
             things[bag] += self._things(frame, sights)
         events: dict[str, list[Row]] = defaultdict(list)
         detections: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
+        undecodable = Counter[str]()
         for topic in view.timeline.topics():
             types = view.timeline.types_of(topic)
             if not any(map(has_events, types)):
@@ -200,12 +205,15 @@ class RowMaker:
             by_file = events_by_bag(view, tables, files)
             for file, of_topic in by_file.items():
                 events[file] += self._events_of(topic, of_topic)
+            if not any(map(may_have_detections, types)):
+                continue
+            undecodable.update({file: of_topic.undecodable for file, of_topic in by_file.items()})
             # A bag whose events show no detections is not decoded.
             seen = {file for file, of_topic in by_file.items() if of_topic.visible.size}
-            if seen and any(map(may_have_detections, types)):
-                for bag, rows in self._rows_by_bag(topic, window, seen):
-                    detections[bag][topic].append(rows)
-        return _Derived(self._poses_by_file(bags, window), events, things, detections)
+            for bag, rows in self._rows_by_bag(topic, window, seen) if seen else ():
+                detections[bag][topic].append(rows)
+        poses = self._poses_by_file(bags, window)
+        return _Derived(poses, events, things, detections, undecodable)
 
     def _rows_by_bag(
         self, topic: str, window: TimeWindow, files: Collection[str]
@@ -241,13 +249,17 @@ class RowMaker:
         """Returns the rows of one bag by table, without the columns that all tables have."""
         tracks = self._tracks(bag)
         map_frame, track = tracks[0] if tracks else (None, empty_track())
-        sightings, undecodable = self._sightings(derived.detections.get(bag, {}), map_frame, track)
+        channels = self._channels(bag)
+        sightings: list[Row] = []
+        for topic, rows in derived.detections.get(bag, {}).items():
+            numbers = _numbers_by_type(channels, topic)
+            sightings += self._sightings(topic, rows, numbers, map_frame, track)
         driven, stops = self._driven(derived.poses.get(bag.file))
         joined = self.memory.index.joined_with(bag.recording)
         of_bag_alone = {
             "recording": bag.recording.name,
             "messages": bag.summary.count,
-            "undecodable": undecodable,
+            "undecodable": derived.undecodable[bag.file],
             "detections": len(sightings),
             "pose_topic": self._path_topic,
             "map_frame": map_frame,
@@ -257,7 +269,7 @@ class RowMaker:
             "joined": "/".join(joined) or None,
         }
         return {
-            "channels": self._channels(bag),
+            "channels": _channel_rows(channels),
             "poses": (row for of_frame in tracks for row in self._poses(*of_frame)),
             "sightings": sightings,
             "things": derived.things.get(bag, ()),
@@ -339,8 +351,8 @@ class RowMaker:
         stood_ns = sum(stop.length for stop in standstills)
         return {**driven, "stood_s": unix_from_ns(stood_ns)}, events
 
-    def _channels(self, bag: BagFile) -> Iterator[Row]:
-        """Yields the channels, by topic.
+    def _channels(self, bag: BagFile) -> list[_Messages]:
+        """Returns the messages of a bag by channel, in order of topics and types.
 
         Raises:
             BagError: the bag is damaged; it is not shipped as if it were whole.
@@ -356,28 +368,23 @@ class RowMaker:
                 by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             by_channel[id(channel)].add(batch)
             _drop_payloads(by_channel.values())
-        order = sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
-        times = [distinct(np.concatenate(messages.parts, 1)[0]) for messages in order]
-        none = np.empty(0, np.int64)
-        log_times, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
-        tied = log_times[channels > 1]
-        for number, messages in enumerate(order):
-            yield messages.row(number, tied)
+        return sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
 
     def _sightings(
-        self, rows_of_topics: Mapping[str, Sequence[Rows]], frame: str | None, track: RobotTrack
-    ) -> tuple[list[Row], int]:
-        """Returns the detections in a bag, and how many messages of its topics are undecodable."""
-        sightings, undecodable = list[Row](), 0
-        for topic, of_topic in rows_of_topics.items():
-            times = np.sort(np.concatenate([rows.times for rows in of_topic]))
-            for rows, detected in chain.from_iterable(map(self._detected, of_topic)):
-                undecodable += len(rows) - len(detected.log_times)
-                same = {"topic": topic, "type": rows.table.channel.type}
-                message = np.searchsorted(times, detected.log_times)
-                message += rows.ranks[np.isin(rows.times, detected.log_times)]
-                sightings += self._sighting_rows(same, detected, message, frame, track)
-        return sightings, undecodable
+        self,
+        topic: str,
+        of_bag: Iterable[Rows],
+        numbers: Mapping[str, _Numbers],
+        frame: str | None,
+        track: RobotTrack,
+    ) -> Iterator[Row]:
+        """Yields a row for each detection on a topic in a bag."""
+        for rows, detected in chain.from_iterable(map(self._detected, of_bag)):
+            kind = rows.table.channel.type
+            ranks = rows.ranks[np.isin(rows.times, detected.log_times)]
+            at = np.searchsorted(numbers[kind].times, detected.log_times) + ranks
+            same = {"topic": topic, "type": kind}
+            yield from self._sighting_rows(same, detected, numbers[kind].numbers[at], frame, track)
 
     def _detected(self, rows: Rows) -> Iterator[tuple[Rows, Detected]]:
         """Yields rows with their detections; apart by rank if any is undecodable and some are tied.
@@ -444,6 +451,38 @@ class RowMaker:
         for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)
+
+
+class _Numbers(NamedTuple):
+    """The log times of messages in order, and their numbers among all messages of the topic."""
+
+    times: IntArray
+    numbers: IntArray
+
+
+def _numbers_by_type(channels: Iterable[_Messages], topic: str) -> dict[str, _Numbers]:
+    """Returns the numbers of a topic's messages, in order of log time and place, by type."""
+    of_topic = [messages for messages in channels if messages.channel.topic == topic]
+    parts = [np.concatenate(messages.parts, 1) for messages in of_topic]
+    times, places, _ = np.concatenate(parts, 1)
+    order = np.lexsort((places, times))
+    channel_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])[order]
+    numbers: dict[str, _Numbers] = {}
+    for kind in {messages.channel.type for messages in of_topic}:
+        own = [nth for nth, messages in enumerate(of_topic) if messages.channel.type == kind]
+        at = np.flatnonzero(np.isin(channel_of, own))
+        numbers[kind] = _Numbers(times[order][at], at)
+    return numbers
+
+
+def _channel_rows(channels: Sequence[_Messages]) -> Iterator[Row]:
+    """Yields the rows of a bag's channels."""
+    times = [distinct(np.concatenate(messages.parts, 1)[0]) for messages in channels]
+    none = np.empty(0, np.int64)
+    log_times, occurrences = np.unique(np.concatenate([none, *times]), return_counts=True)
+    tied = log_times[occurrences > 1]
+    for number, messages in enumerate(channels):
+        yield messages.row(number, tied)
 
 
 def _drop_payloads(channels: Collection[_Messages]) -> None:

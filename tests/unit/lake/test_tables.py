@@ -20,7 +20,16 @@ from ros2_memory.history.detections import Detected, DetectionRows
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.tables import NAMESPACE, TABLES, bags_condition, open_tables
 from ros2_memory.lake.warehouse import LakeFile, LakeLocation
-from tests.support.bags import Msg, battery, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import (
+    Msg,
+    battery,
+    detections,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.fleets import NOW, START_S
 from tests.support.lakes import lake_in, lake_rows, robot_bags, ship
 from tests.support.memories import memory_of
@@ -119,6 +128,39 @@ def test_messages_of_one_time_have_their_own_numbers_beside_one_that_cannot_be_d
     assert [row["undecodable"] for row in lake_rows(tmp_path / "lake", "bags")] == [1]
     [row] = lake_rows(tmp_path / "lake", "messages")
     assert math.isnan(dict(row["numbers"])["percentage"])
+
+
+def test_numbers_of_messages_of_two_types_on_one_topic_are_those_of_their_places(
+    tmp_path: Path,
+) -> None:
+    """Those of one log time had one number in `sightings`, and two in `messages`."""
+    topic, found = "/seen", json.dumps({"label": "mug"})
+    both = [
+        message
+        for at in range(3)
+        for message in (
+            text(at * NS_PER_S + 1, found, topic),
+            detections(at * NS_PER_S + 1, ["cup"], topic=topic),
+        )
+    ]
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", both)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=[topic])])
+    whole = {row["message"]: row["type"] for row in lake_rows(tmp_path / "lake", "messages")}
+    assert whole == {nth: message.type for nth, message in enumerate(both)}
+    seen = {row["message"]: row["type"] for row in lake_rows(tmp_path / "lake", "sightings")}
+    assert seen == whole
+
+
+def test_messages_that_cannot_be_decoded_are_counted_also_where_nothing_was_seen(
+    tmp_path: Path,
+) -> None:
+    spoiled = [
+        replace(detections(at * NS_PER_S, ["cup"]), body=b"\x00\x01\x00\x00\xff") for at in range(4)
+    ]
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*spoiled, detections(NOW, [])])
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
+    [row] = lake_rows(tmp_path / "lake", "bags")
+    assert (row["undecodable"], row["detections"]) == (4, 0)
 
 
 def test_a_tie_and_a_message_that_cannot_be_decoded_cost_no_read_for_each_other_message(
