@@ -75,7 +75,7 @@ _MOST_OF_MESSAGE: Final = 512
 _LEAST_OF_CHANNEL: Final = 16 << 10
 """... unless the channel takes less than this, such as a robot description or a map of a room."""
 _MOST_BYTES: Final = 64 << 20
-"""Payloads of a bag that are in memory at once; beyond it the largest channel is dropped first."""
+"""Payloads of a bag, besides those shipped whole, that are in memory at once."""
 _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"}
 """The map of `messages` that has values of a type."""
 _LARGEST: Final = 1 << 63
@@ -486,12 +486,11 @@ def _channel_rows(channels: Sequence[_Messages]) -> Iterator[Row]:
 
 
 def _drop_payloads(channels: Collection[_Messages]) -> None:
-    """Drops payloads of the largest channels that are not whole, down to `_MOST_BYTES` in all."""
+    """Drops payloads of the largest channels, until those not shipped whole have `_MOST_BYTES`."""
     droppable = [messages for messages in channels if not messages.is_whole]
-    while droppable and sum(messages.size for messages in channels) > _MOST_BYTES:
+    while sum(messages.size for messages in droppable) > _MOST_BYTES:
         largest = max(droppable, key=attrgetter("size"))
         largest.payloads, largest.size = None, 0
-        droppable.remove(largest)
 
 
 def _rows(same: Row, **columns: IntArray | NDArray[np.float64] | Iterable[object]) -> Iterator[Row]:

@@ -275,6 +275,10 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     # Of more than may be in memory the largest goes.
     monkeypatch.setattr("ros2_memory.lake.rows._MOST_BYTES", 8_000)
     assert whole("short") == set()
+    # What is shipped whole takes no room of others.
+    assert whole("short_whole", "/map", "/scan") == {"/map", "/scan"}
+    monkeypatch.setattr("ros2_memory.lake.rows._MOST_BYTES", 9_000)
+    assert whole("beside", "/scan") == {"/map", "/scan"}
 
 
 def hub(folder: Path, name: str) -> LakeLocation:
