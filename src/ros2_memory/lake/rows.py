@@ -56,6 +56,7 @@ from ros2_memory.places.pose_frames import known_placement
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SightReader, may_have_detections
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -530,8 +531,7 @@ def _split_value(value: JsonValue) -> Row:
         scalars[kind].append((path, inner))
         return None
 
-    text = json.dumps(without_scalars(value, ""), ensure_ascii=False, separators=(",", ":"))
-    return {**scalars, "value": text}
+    return {**scalars, "value": to_json_text(without_scalars(value, ""))}
 
 
 @dataclass(slots=True, eq=False)

@@ -7,6 +7,7 @@ from datetime import date, timedelta
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -24,6 +25,7 @@ from tests.support.bags import (
     Msg,
     battery,
     detections,
+    make,
     odom,
     text,
     tf,
@@ -279,6 +281,20 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     assert whole("short_whole", "/map", "/scan") == {"/map", "/scan"}
     monkeypatch.setattr("ros2_memory.lake.rows._MOST_BYTES", 9_000)
     assert whole("beside", "/scan") == {"/map", "/scan"}
+
+
+def test_values_are_json_also_of_ranges_that_are_not_finite(tmp_path: Path) -> None:
+    """A laser scan is infinite where it meets nothing: no program read `Infinity`."""
+    ranges = make(
+        "std_msgs/msg/Float64MultiArray",
+        layout=make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0),
+        data=np.array([1.0, math.inf, math.nan]),
+    )
+    message = Msg("/ranges", "std_msgs/msg/Float64MultiArray", NOW, ranges)
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [message])
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=["/ranges"])])
+    [row] = lake_rows(tmp_path / "lake", "messages")
+    assert json.loads(row["value"], parse_constant=pytest.fail)["data"] == [1.0, None, None]
 
 
 def hub(folder: Path, name: str) -> LakeLocation:
