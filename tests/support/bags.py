@@ -73,6 +73,8 @@ OTHER_ROBOTS = {
     ),
     "yolo_msgs/msg/Detection": "string class_name\nfloat64 score\nstring id\n",
     "yolo_msgs/msg/DetectionArray": "std_msgs/Header header\nDetection[] detections\n",
+    "own_msgs/msg/NamedTwice": "string label\nstring class_name\nfloat32 score\n",
+    "own_msgs/msg/NamedTwiceArray": "NamedTwice[] detections\n",
     "aruco_opencv_msgs/msg/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose\n",
     "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
     "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",

@@ -100,9 +100,9 @@ def _texts_or(texts: Texts, fallback: Texts, *, replace_blank: bool = False) -> 
     is_empty = [not (word.strip() if replace_blank else word) for word in texts.words]
     if not any(is_empty):
         return texts
-    use_fallback = np.array(is_empty)[texts.codes]
-    codes = np.where(use_fallback, fallback.codes + len(texts.words), texts.codes)
-    return Texts(codes.astype(np.uint32), (*texts.words, *fallback.words))
+    both = joined_texts([texts, fallback])
+    codes, fallback_codes = np.split(both.codes, 2)
+    return Texts(np.where(np.array(is_empty)[texts.codes], fallback_codes, codes), both.words)
 
 
 class Point(NamedTuple):

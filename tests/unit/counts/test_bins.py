@@ -360,6 +360,19 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
     assert counts == sorted(counts, reverse=True)
 
 
+@each_way
+def test_a_label_that_two_fields_may_name_is_one_label(tmp_path: Path, recalls: bool) -> None:
+    """Once a blank label made a label of the other field, 0 cups were in view at once."""
+    kind, named = "own_msgs/msg/NamedTwice", [[("cup", "cup")] * 3, [("", "box"), ("", "cup")]]
+    messages = []
+    for nth, names in enumerate(named):
+        seen = [make(kind, label=label, class_name=name, score=0.9) for label, name in names]
+        body = make(f"{kind}Array", detections=seen)
+        messages.append(Msg(SEEN, f"{kind}Array", (BEGIN + nth) * S, body))
+    rows = table(asked(remembered(tmp_path, messages, recalls=recalls), "find_matches", **ANY))
+    assert (rows["cup"]["most_at_once"], rows["box"]["most_at_once"]) == (3, 1)
+
+
 @pytest.mark.parametrize(
     "given",
     [
