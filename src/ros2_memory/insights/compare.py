@@ -73,6 +73,7 @@ from ros2_memory.things.unseen import (
     note_undecoded,
     renamed_notes,
     scatter_notes,
+    shift_notes,
     unplaced_notes,
     vague_notes,
 )
@@ -282,7 +283,8 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     places = places_asked(limits, where, things.frames)
     between = _ThingsBetween(things, earlier, later, where, places)
     compared, moves = between.compare()
-    view.notes.add(*look_alike_notes(things, moves), *scatter_notes(between.scattered(compared)))
+    view.notes.add(*look_alike_notes(things, moves), *shift_notes(moves, compared.same))
+    view.notes.add(*scatter_notes(between.scattered(compared)))
     missed = {thing.label for thing in compared.not_seen_where_expected}
     instances = (thing for thing in things.estimate.instances if thing.label in missed)
     view.notes.add(*renamed_notes(things, islice(instances, _MOST_SCATTERED)))

@@ -67,6 +67,9 @@ _MOST_NAMED: Final = 5
 _SCATTERS: Final = 3.0
 """Things of one label that are no farther apart than so many times their scatter may be one."""
 _SAME_PLACE_M: Final = 0.2
+_FEWEST_SHIFTED: Final = 3
+_SAME_WAY_MM: Final = 120.0
+"""Two things that a map shifted went ways that differ by less, the noise of where they are seen."""
 _MANY_MESSAGES: Final = 10
 """What is seen in one of so many messages may be mistaken."""
 _MOST_TYPES: Final = 3
@@ -498,6 +501,23 @@ def look_alike_notes(known: KnownThings, moves: Iterable[Move]) -> Iterator[str]
             "which one of a label moved is a guess, since others of it came or went meanwhile: "
             f"{listed(labels, at_most=_MOST_NAMED)}",
             most,
+        )
+
+
+def shift_notes(moves: Sequence[Move], unchanged: int) -> Iterator[str]:
+    """Yields how many things went the same way while few stayed: the map may have shifted there."""
+    ways = np.array(
+        [(move.after.x - move.before.x, move.after.y - move.before.y) for move in moves]
+    )
+    if len(ways) < _FEWEST_SHIFTED:
+        return
+    middle = np.median(ways, axis=0)
+    alike = np.count_nonzero(np.hypot(*(ways - middle).T) <= _SAME_WAY_MM)
+    if alike >= _FEWEST_SHIFTED and alike > (len(ways) + unchanged) / 2:
+        x, y = (middle / 1000).tolist()
+        yield (
+            f"{alike} of the {len(ways)} things in moved went the same way, x {x:+.2f} m and "
+            f"y {y:+.2f} m: the map may have shifted, and not they"
         )
 
 

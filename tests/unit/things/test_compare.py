@@ -31,6 +31,7 @@ from tests.unit.things.test_find import (
     HERE,
     NAMED,
     S,
+    Seen,
     looked,
     scene,
 )
@@ -92,6 +93,24 @@ def test_one_more_that_came_since_the_visit_before_stands_beside_the_other(tmp_p
     assert (more["was"]["at_once"], more["is"]["at_once"]) == (1, 2)
     found = ask(tmp_path, "find_things", label="cup")
     assert (found["total"], found["things"][0]["at_once"]) == (2, 2)
+
+
+def test_things_that_all_went_the_same_way_may_stand_on_a_map_that_shifted(tmp_path: Path) -> None:
+    stood = [("cup", 3.0, 0.0), ("mug", 3.0, 1.0), ("book", 2.5, -1.0), ("vase", 2.0, 0.5)]
+    more = [("lamp", 2.0, -0.5), ("jar", 4.0, 0.5), ("bowl", 4.0, -0.5)]
+    shifted = [(label, x + 0.3, y + 0.01 * nth) for nth, (label, x, y) in enumerate(stood)]
+    pushed = [(label, x + 0.3 * nth, y - 0.3) for nth, (label, x, y) in enumerate(stood)]
+
+    def notes(name: str, was: Sequence[Seen], now: Sequence[Seen]) -> list[str]:
+        reply = compared(tmp_path / name, [*looked(0, 30, HERE, *was), *looked(60, 90, HERE, *now)])
+        return [note for note in reply.get("notes", ()) if "shifted" in note]
+
+    [note] = notes("all", stood, shifted)
+    assert note.startswith("4 of the 4 things in moved went the same way, x +0.30 m and y +0.0")
+    [note] = notes("most", stood, [*shifted[:3], pushed[3]])
+    assert note.startswith("3 of the 4 things")
+    assert notes("three of seven", [*stood, *more], [*shifted[:3], stood[3], *more]) == []
+    assert notes("each its own", stood, pushed) == []
 
 
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
