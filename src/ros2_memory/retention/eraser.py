@@ -81,7 +81,7 @@ class Holder:
     Attributes:
         paths: all its names in the bag directory that may be changed.
         counts: how many messages go, by topic.
-        windows: how many messages go, by topic and window.
+        windows: the same by topic and window, without copies that count in another recording.
         ids: the ids of the messages in sidecars, by topic; only of topics that a sidecar lists.
     """
 
@@ -321,13 +321,14 @@ class Eraser:
             for message_list in (handover.also_counts, handover.counts_elsewhere):
                 listed_topics.update(message_list.get(path.name, ()))
         all_windows = TimeWindow(erasure.windows[0][0], erasure.windows[-1][1])
+        rule = read_handover(paths[0].parent).handover.rule(paths[0].name)
         for topic in topics:
             span = TimeWindow.everything() if topic in erasure.latched else all_windows
             for record in self.reader.records(paths[0], (topic,), span):
                 window = erasure.window_of(topic, record.log_time, record.publish_time)
                 if window is not None:
                     holder.counts[topic] += 1
-                    holder.windows[topic, *window] += 1
+                    holder.windows[topic, *window] += rule is None or rule.counts(record)
                     if topic in listed_topics:
                         identity = message_id(record.publish_time, record.payload)
                         holder.ids.setdefault(topic, set()).add(identity)

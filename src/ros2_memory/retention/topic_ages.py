@@ -19,6 +19,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from itertools import groupby, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
@@ -198,16 +199,18 @@ class TopicCutter:
         """
         path = cut.bag.path
         before = path.lstat()
-        losses = [
-            Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
-            for topic in self.reader.summarize(path).topics
-            if topic.topic in cut.topics
-        ]
         gone = Counter[str]()
-        for loss in losses:
-            gone[loss.topic] += loss.lost
+        for topic in self.reader.summarize(path).topics:
+            if topic.topic in cut.topics:
+                gone[topic.topic] += topic.count
         if not gone:
             return gone
+        # Without the copies of messages that count in another recording.
+        losses = [
+            Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
+            for topic in BagDirReader(self.reader, self.bag_dir).summarize(path).topics
+            if topic.topic in cut.topics
+        ]
         bag = os.path.relpath(path, self.bag_dir)
         expired = self._read_expired()
         EXPIRED.write(self.bag_dir, expired.then(bag, losses))

@@ -21,7 +21,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import Reader
 
-from ros2_memory.bag_dir.handover_file import message_id
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, message_id, write_handover
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
@@ -219,6 +219,20 @@ def test_sidecars_follow(bag_dir: Path, forget: Forget) -> None:
         "rec_a_2.mcap": {CAMERA: ids[CAMERA]},
     }
     assert sidecar.stat().st_mtime_ns == written
+
+
+def test_a_message_that_two_recordings_have_is_counted_once_as_deleted(
+    bag_dir: Path, forget: Forget
+) -> None:
+    cut = T0 + 25 * S
+    left(write_mcap(bag_dir / "rec_b" / "rec_b_0.mcap", messages(2)))
+    until, begun = (Overlap(None, None, (f"{name}.mcap",)) for name in ("rec_a_2", "rec_b_0"))
+    write_handover(bag_dir / "rec_a", Handover(next="rec_b", counts_until=cut, end=until))
+    write_handover(bag_dir / "rec_b", Handover(previous="rec_a", counts_from=cut, begin=begun))
+    own_all(bag_dir)
+    forget(0, 20, 30, OF_CAMERA)
+    assert traces(bag_dir, f"{SAID} 2") == []
+    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
 
 
 def test_answers_say_that_messages_were_deleted(

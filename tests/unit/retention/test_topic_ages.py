@@ -151,6 +151,18 @@ def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
     assert counts_of(bag)["/odom"] == 100
 
 
+def test_a_message_that_two_recordings_have_is_counted_once(bag_dir: Path) -> None:
+    bags = [split(bag_dir, 2, name=name) for name in ("rec_B", "rec_C")]
+    cut = T0 + 2 * HOUR + 5 * S
+    until, begun = (Overlap(None, None, (bag.name,)) for bag in bags)
+    write_handover(bags[0].parent, Handover(next="rec_C", counts_until=cut, end=until))
+    write_handover(bags[1].parent, Handover(previous="rec_B", counts_from=cut, begin=begun))
+    own_all(bag_dir)
+    house(bag_dir).apply()
+    assert [loss.lost for loss in read_losses(bag_dir, T0 + 2 * HOUR, MAX_NS)] == [5, 5]
+    assert not {"/speech"}.intersection(*map(counts_of, bags))
+
+
 def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: Path) -> None:
     saved = bag_dir / "rec_A" / "rec_A_0.mcap"
     moment = bag_dir / "moments" / "kept"
