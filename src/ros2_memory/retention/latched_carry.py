@@ -102,6 +102,8 @@ class MessageIdentity(NamedTuple):
     payload: bytes
 
 
+_Copy: TypeAlias = tuple[Ns, MessageIdentity]
+"""A message by its log time, too: which copy of it."""
 _LateMessages: TypeAlias = "dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]]"
 """By bag, its mtime and topic: the late messages at its beginning, and their log times."""
 
@@ -118,7 +120,7 @@ class Latched(NamedTuple):
     subjects: tuple[tuple[str, str], ...]
 
     @property
-    def copy(self) -> tuple[Ns, MessageIdentity]:
+    def copy(self) -> _Copy:
         """What shows which copy of the message it is."""
         return self.log_time, self.identity
 
@@ -210,22 +212,22 @@ class Carrier:
         if not with_messages:
             return None
         topics = self.topics(snapshot)
-        gone = to_delete.difference(saved)
-        kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_derived(bag.file)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
         }
-        remaining = {self._folder(recording) for recording in {bag.recording for bag in kept}}
         origins = dict(carried)
         for bag in with_messages:
             origins.update(self._latched_in(snapshot, bag, topics))
+        gone = to_delete.difference(saved)
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_derived(bag.file)]
         wanted = worth_carrying(
             origins,
             united((bag.start, bag.end + 1) for bag in kept),
             self._repeated(snapshot, topics, to_delete),
         )
-        chosen = {message.copy: _merged_origin(message, origins, remaining) for message in wanted}
+        remaining = frozenset(map(self._folder, {bag.recording for bag in kept}))
+        chosen = _with_origins(wanted, origins, remaining)
         if chosen == {message.copy: origin for message, origin in carried.items()}:
             return None
         sources = [self.path, *(bag.path for bag in with_messages)]
@@ -298,7 +300,7 @@ class Carrier:
         self,
         sources: Iterable[Path],
         topics: Collection[str],
-        chosen: Mapping[tuple[Ns, MessageIdentity], Origin | None],
+        chosen: Mapping[_Copy, Origin | None],
     ) -> Iterator[Record]:
         """Yields the chosen messages with their payload and origin."""
         missing = {*chosen}
@@ -387,19 +389,19 @@ def _is_tf(type_name: str) -> bool:
     return type_name.rpartition("/")[2].lower() == "tfmessage"
 
 
-def _merged_origin(
-    wanted: Latched, origins: Mapping[Latched, Origin | None], remaining: Collection[str]
-) -> Origin | None:
-    """Returns the origin of a message, with the recordings of its copies that still have bags."""
-    origin_of_wanted = origins[wanted]
-    if origin_of_wanted is None:
-        return None
-    copies = [
-        recording
-        for message, origin in origins.items()
-        if message.identity == wanted.identity and origin is not None
-        for recording in origin.recordings
-        if recording in remaining
-    ]
-    first, *others = origin_of_wanted.recordings
-    return origin_of_wanted._replace(recordings=(first, *sorted({*others, *copies} - {first})))
+def _with_origins(
+    wanted: Iterable[Latched], origins: Mapping[Latched, Origin | None], remaining: frozenset[str]
+) -> dict[_Copy, Origin | None]:
+    """Returns the wanted messages with all recordings that received them and still have bags."""
+    received: defaultdict[MessageIdentity, set[str]] = defaultdict(set)
+    for message, origin in origins.items():
+        if origin is not None:
+            received[message.identity].update(remaining.intersection(origin.recordings))
+    chosen: dict[_Copy, Origin | None] = {}
+    for message in wanted:
+        chosen[message.copy] = origin = origins[message]
+        if origin is not None:
+            first, *others = origin.recordings
+            others = sorted({*others, *received[message.identity]} - {first})
+            chosen[message.copy] = origin._replace(recordings=(first, *others))
+    return chosen
