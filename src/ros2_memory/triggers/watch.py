@@ -298,11 +298,15 @@ class _RuleLook:
     snapshot: Snapshot
 
     def add(self, firing: Firing) -> None:
-        """Counts a firing, and joins it to the newest moment of the rule or begins another."""
+        """Counts a firing, and saves what the rule wants of it."""
+        self.record.fired += 1
+        self.record.last_fired = firing.at
+        _log.info("trigger_fired", rule=self.rule.name, topic=firing.topic, at_ns=firing.at)
+        self._save(firing)
+
+    def _save(self, firing: Firing) -> None:
+        """Joins the window of a firing to the newest moment of the rule, or begins another."""
         rule, record = self.rule, self.record
-        record.fired += 1
-        record.last_fired = firing.at
-        _log.info("trigger_fired", rule=rule.name, topic=firing.topic, at_ns=firing.at)
         window = rule.window(firing.first, firing.at)
         newest = record.newest[-1] if record.newest else None
         if newest is not None and _joins(newest, window):
@@ -334,7 +338,11 @@ class _RuleLook:
         """Counts restarts, stores the moments that wait, and what keeps the rule from firing."""
         if self.rule.kind == "recorder_restart":
             for first, at in restarts:
-                self.add(Firing(self.rule.name, "", first, at))
+                is_long = at - first > LONGEST_NS
+                if is_long:
+                    # Nothing was recorded meanwhile: bags that are dated there had another clock.
+                    self._save(Firing(self.rule.name, "", first, first))
+                self.add(Firing(self.rule.name, "", at if is_long else first, at))
         self._check_topic()
         self._store_moments()
         self._note_lasting_match()
@@ -375,7 +383,9 @@ class _RuleLook:
             return True
         moment.stored = True
         if refused is not None:
-            self._refuse(refused)
+            # A recorder that restarts may have recorded nothing before.
+            if (self.rule.kind, refused.kind) != ("recorder_restart", "unrecorded"):
+                self._refuse(refused)
             if not moment.known:
                 # What saved nothing does not count in `max_per_hour`.
                 first, last = moment.start, moment.end

@@ -196,6 +196,34 @@ def test_a_recording_that_ended_unasked_and_a_recorder_that_was_killed(tmp_path:
     assert robot.record("restart").fired == 2
 
 
+def test_of_a_long_restart_its_two_ends_are_saved_whatever_other_clocks_date_between(
+    tmp_path: Path,
+) -> None:
+    robot = watched(tmp_path, rule("restart", **RESTART))
+    robot.begin(T0)
+    for begin in range(0, 60, 10):
+        robot.split(seconds(begin, begin + 10))
+    robot.beat(state=RecorderState.STOPPED)
+    robot.look()
+    # It boots with an empty clock, and is killed before that is set.
+    robot.clock.at = T0 - 3000 * S
+    robot.beat(robot.names[-1])
+    robot.clock.at = T0 + 60 * S
+    robot.house = robot.new_house()
+    robot.house.prepare()
+    robot.look()
+    assert robot.spans() == [(55, 63)]
+    robot.beat(robot.names[-1])
+    robot.clock.at = T0 + 9000 * S
+    robot.house = robot.new_house()
+    robot.house.prepare()
+    robot.split([*seconds(60, 65), *seconds(8999, 9003)])
+    robot.look()
+    assert robot.spans() == [(55, 63), (8995, 9003)]
+    record = robot.record("restart")
+    assert (record.fired, record.moments, record.refused, record.problem) == (2, 2, 0, None)
+
+
 def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
     noisy = rule("noisy", before=0, after=0, max_bytes=6_000)
     quiet = rule("quiet", topic="/door", max_bytes=6_000)
