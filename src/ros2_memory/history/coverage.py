@@ -274,12 +274,14 @@ def _split_by_cause(
     """Yields the parts of a gap: cause, start and end. The cause is "" if it is not known.
 
     An interruption explains `margin` more on both sides: messages that had not reached the disk
-    were lost as well, and a restart takes time.
+    were lost as well, and a restart takes time. It begins or ends in the gap, or nearly: within a
+    longer one bags were recorded, so the clock was set in it.
     """
     first, last = gap
     unexplained = [gap]
     for loss in interruptions:
-        if loss.start < last and first < loss.stop:
+        has_an_end = first - _RESTART_NS <= loss.start or loss.stop <= last + _RESTART_NS
+        if loss.start < last and first < loss.stop and has_an_end:
             rest = without(unexplained, [(loss.start - margin, loss.stop + margin)])
             for start, end in without(unexplained, rest):
                 yield loss.by, start, end

@@ -687,6 +687,14 @@ def test_a_cause_is_said_of_the_interruption_and_not_of_the_whole_gap(apart: Pat
     assert "60 s" not in doubts
 
 
+def test_a_restart_across_which_the_clock_was_set_is_the_cause_of_no_gap_between_its_dates(
+    apart: Path,
+) -> None:
+    interrupted(apart, -90 * 86400, 150, "unclean")
+    assert causes(apart) == ["nothing was recorded from 020.000000 to 100.000000 (80 s)"]
+    assert "nothing was recorded" not in str(ask(apart, "memory_status").get("doubts"))
+
+
 @pytest.mark.parametrize(
     ("start", "end", "is_told"),
     [(99.99, 110, False), (0, 20.01, False), (95, 110, True), (99.5, 103, True)],
