@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import yaml
 
-from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.recorder.background import Background
     from ros2_memory.storage.base import BagReader
 
@@ -441,11 +441,14 @@ class Reception:
         recording.span = first, end
 
 
-def newest_splits(bag_dir: Path) -> list[Path]:
-    """Returns the newest splits in a bag directory, in the order of its recordings' names."""
+def newest_splits(bag_dir: Path, own: OwnRecordings) -> list[Path]:
+    """Returns the newest splits of a recorder's own recordings, in the order in which these began.
+
+    Their names have dates, which a wrong clock may have made.
+    """
     newest: list[Path] = []
     with suppress(OSError):
-        folders = sorted(folder for folder in bag_dir.iterdir() if has_own_name(folder.name))
+        folders = [bag_dir / name for name in own.in_order()]
         for folder in [*filter(is_folder, folders)][-_NEWEST_SPLITS:]:
             splits = sorted(folder.glob(f"*{MCAP}"), key=lambda split: split.lstat().st_mtime_ns)
             newest += filter(size_of, splits)

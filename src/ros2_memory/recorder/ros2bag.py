@@ -143,7 +143,7 @@ class Ros2BagRecorder(Recorder):
         if not self._checked:
             self.check()
         self._checked = False
-        self._reception.recall(newest_splits(self._bag_dir))
+        self._reception.recall(newest_splits(self._bag_dir, self.own))
         self._supervisor.start()
 
     def tick(self) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import Loss, read_losses
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR
 from ros2_memory.recorder import measure
@@ -276,17 +277,24 @@ def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
     assert (loss.topic, loss.lost, loss.by) == ("/odom", 7, "rosbag2")
 
 
-def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
-    assert newest_splits(tmp_path) == []
-    assert newest_splits(tmp_path / "none") == []
-    older = [split(tmp_path / "rec_20261120T080000Z" / f"x_{n}.mcap", 5, 1) for n in range(3)]
-    split(tmp_path / "other" / "x_0.mcap", 5, 1)
-    newest = split(tmp_path / "rec_20261120T090000Z" / "x_0.mcap", 5, 1)
-    (tmp_path / "rec_20261120T090000Z" / "x_1.mcap").touch()
+def test_the_newest_splits_of_an_earlier_run_are_found_also_after_a_clock_that_was_ahead(
+    tmp_path: Path,
+) -> None:
+    own = OwnRecordings(tmp_path)
+    assert newest_splits(tmp_path, own) == []
+    assert newest_splits(tmp_path / "none", OwnRecordings(tmp_path / "none")) == []
+    ahead, later, last = "rec_20361120T080000Z", "rec_20261120T080000Z", "rec_20261120T090000Z"
+    for name in (ahead, later, last, "rec_20261120T100000Z"):
+        own.begin(name)
+    split(tmp_path / ahead / "x_0.mcap", 5, 1)
+    older = [split(tmp_path / later / f"x_{n}.mcap", 5, 1) for n in range(3)]
+    split(tmp_path / "rec_20261120T110000Z" / "x_0.mcap", 5, 1)  # restored from elsewhere
+    newest = split(tmp_path / last / "x_0.mcap", 5, 1)
+    (tmp_path / last / "x_1.mcap").touch()
     elsewhere = split(tmp_path / "other" / "x_1.mcap", 5, 1)
-    (tmp_path / "rec_20261120T090000Z" / "x_2.mcap").symlink_to(elsewhere)
+    (tmp_path / last / "x_2.mcap").symlink_to(elsewhere)
     (tmp_path / "rec_20261120T100000Z").symlink_to(elsewhere.parent)
-    assert newest_splits(tmp_path) == [*older[1:], newest]
+    assert newest_splits(tmp_path, own) == [*older[1:], newest]
 
 
 def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended(
@@ -297,7 +305,9 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
     (folder / "x_1.mcap").write_bytes(b"nothing")
     split(folder / "x_2.mcap", 50, 1, topic="/scan")
     made = reception(tmp_path)
-    made.recall(newest_splits(tmp_path))
+    own = OwnRecordings(tmp_path)
+    own.begin(folder.name)
+    made.recall(newest_splits(tmp_path, own))
     asked = profiles(made, "a")
     assert (asked["/odom"]["depth"], asked["/scan"]["depth"]) == (400, 200)
     assert made.lost_in_last_hour(T0) == {}
