@@ -178,10 +178,13 @@ class LossCounter:
         return [loss]
 
     def in_last_hour(self, now: Ns) -> dict[str, int]:
-        """Returns how many messages of each topic are missing in the last hour."""
+        """Returns how many messages of each topic are missing in the last hour.
+
+        What is dated an hour or more after now is of a clock that was set back.
+        """
         lost = Counter[str]()
         for loss in self._lately:
-            if loss.stop > now - NS_PER_HOUR:
+            if abs(loss.stop - now) < NS_PER_HOUR:
                 lost[loss.topic] += loss.lost
         return dict(lost)
 

@@ -466,6 +466,7 @@ def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     assert found == ("/odom", T0 + 99 * PERIOD + 1000, 3, "stamps")
     assert counter.in_last_hour(loss.stop) == {"/odom": 3}
     assert counter.in_last_hour(loss.stop + NS_PER_HOUR) == {}
+    assert counter.in_last_hour(loss.stop - NS_PER_HOUR) == {}  # the clock was set back
 
 
 def test_losses_of_a_topic_with_few_messages_in_each_split_count() -> None:
