@@ -362,7 +362,7 @@ class Housekeeping:
                 state_bytes=state,
                 reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
                 f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
-                f"{saved / _MB:.3g} MB, open, damaged or newest bags "
+                f"{saved / _MB:.3g} MB, memory/, latched/ and open, damaged or newest bags "
                 f"{(total - state - saved) / _MB:.3g} MB; raise retention.max_total_gb",
             )
 

@@ -235,7 +235,7 @@ def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(tmp_path: Pat
     keeper = keeper_of(tmp_path, max_bytes=1_000_000)
     assert keeper.status().counted_bytes is None
     (reported,) = said(keeper, "budget_not_held")
-    assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
+    assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB, memory/, l" in reported["reason"]
     status = keeper.status()
     assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
 
