@@ -201,7 +201,7 @@ def _as_list(value: object) -> object:
 
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
 Flag: TypeAlias = Annotated[bool, Field(strict=True)]
-Metres: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
+Metres: TypeAlias = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Count: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=_MOST)]
 Mebibytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
 Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
@@ -437,7 +437,7 @@ class LoggingSettings:
 
     level: Literal["debug", "info", "warning", "error"]
     format: Literal["json", "pretty"]
-    arguments: bool
+    arguments: Flag
 
 
 @section
@@ -593,7 +593,7 @@ class KeepRule:
     kind: Literal["message", "silent", "recorder_restart"] = "message"
     topic: Text | None = None
     condition_type: Text | None = None
-    value: bool | int | float | str | dict[str, float] | None = None
+    value: bool | int | float | str | dict[str, Metres] | None = None
     field: Text | None = None
     min_score: Tolerance | None = None
     for_s: Tolerance = 0.0
@@ -637,7 +637,7 @@ class ExcludeRule:
 
     topic: Annotated[Text, _matching(r"[^*?\[]*", "name one topic; make a rule for each")]
     condition_type: Text
-    value: bool | int | float | str | dict[str, float]
+    value: bool | int | float | str | dict[str, Metres]
     field: Text | None = None
     min_score: Tolerance | None = None
     margin_s: Span = 1.0

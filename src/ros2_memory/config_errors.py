@@ -165,8 +165,8 @@ def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> 
     """Returns the keys that the section of an unknown key knows."""
     *sections, _unknown = fault["loc"]
     for section in sections:
-        if get_origin(model) is dict:  # any key: the section is one of them
-            model = get_args(model)[1]
+        if get_origin(model) in {dict, tuple}:  # the section is any key, or a number
+            model = next(kind for kind in get_args(model) if kind is not str)
         else:
             model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
             if type(None) in get_args(model):

@@ -274,6 +274,8 @@ def test_no_number_is_too_large_for_nanoseconds(number: str) -> None:
     [
         ("datas.now=wall", ["datas: unknown key", "recording, data, reader"]),
         ("memory.places_file=a", ["places_file: unknown key; use", "; data.places_file is a key"]),
+        ("recording.required=[{topic: /odom, hz: 1}]", ["required.0.hz: unknown", "topic, min_hz"]),
+        ("logging.arguments='yes'", ["logging.arguments: 'yes'", "boolean"]),
         ("storage.cache=1", ["storage.cache: storage=mcap has no such", "rosbag2"]),
         ("lake.engine.memory_mb=512", ["lake.engine: ", "choose that", "on the command line"]),
         ("~data.now", ["data.now: missing"]),

@@ -146,6 +146,8 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
         "{x: 6, y: 0.6}",
         "{x: [5, 0], y: [0, 9]}",
         "{polygon: [[0, 0], [2, 0]]}",
+        "{x: true, y: 1, radius_m: 1}",
+        "{x: [0, '2'], y: [0, 1]}",
         "{polygon: [[0, 0], [2, 2], [5, 5], [1, 1]]}",
         "{x: 1, y: 1, radius_m: 1, polygon: [[0, 0], [2, 0], [0, 2]]}",
         "{x: [0, 1], y: [0, 1], radius_m: 1}",
