@@ -37,7 +37,16 @@ from typing import (
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic.dataclasses import dataclass
 from pydantic_core import to_jsonable_python
 
@@ -104,6 +113,18 @@ def _matching(pattern: str, rule: str) -> AfterValidator:
         return text
 
     return AfterValidator(check)
+
+
+def _one_of_several(rule: str) -> WrapValidator:
+    """Returns the check of a value of several types: others are refused, in one line."""
+
+    def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
+        try:
+            return validate(value)
+        except ValidationError:
+            raise ValueError(f"must {rule}") from None
+
+    return WrapValidator(check)
 
 
 def is_robot_name(name: str) -> bool:
@@ -228,6 +249,13 @@ DotPath: TypeAlias = Annotated[
     Text, _matching(r"\w+(\.\w+)*", "be a dot-path such as pose.pose.position")
 ]
 RobotName: TypeAlias = Annotated[Text, AfterValidator(_require_robot_name)]
+Extent: TypeAlias = Annotated[
+    Metres | tuple[Metres, Metres], _one_of_several("be a number of metres, or two: [from, to]")
+]
+ConditionValue: TypeAlias = Annotated[
+    bool | int | float | str | dict[str, Metres],
+    _one_of_several("be a text, a number, true or false, or {x: metres, y: metres}"),
+]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
@@ -543,8 +571,8 @@ class PlaceShape:
     """
 
     frame: Text | None = None
-    x: Metres | tuple[Metres, Metres] | None = None
-    y: Metres | tuple[Metres, Metres] | None = None
+    x: Extent | None = None
+    y: Extent | None = None
     radius_m: Positive | None = None
     polygon: tuple[tuple[Metres, Metres], ...] | None = None
 
@@ -593,7 +621,7 @@ class KeepRule:
     kind: Literal["message", "silent", "recorder_restart"] = "message"
     topic: Text | None = None
     condition_type: Text | None = None
-    value: bool | int | float | str | dict[str, Metres] | None = None
+    value: ConditionValue | None = None
     field: Text | None = None
     min_score: Tolerance | None = None
     for_s: Tolerance = 0.0
@@ -637,7 +665,7 @@ class ExcludeRule:
 
     topic: Annotated[Text, _matching(r"[^*?\[]*", "name one topic; make a rule for each")]
     condition_type: Text
-    value: bool | int | float | str | dict[str, Metres]
+    value: ConditionValue
     field: Text | None = None
     min_score: Tolerance | None = None
     margin_s: Span = 1.0

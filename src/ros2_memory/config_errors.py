@@ -144,7 +144,7 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
     if kind == "float_type" and key.endswith("_gb"):
         rule = "must be a number in GB, such as 2"
     else:
-        rule = _RULES.get(kind) or re.sub(r"^(Input|String|Value) should ", "must ", fault["msg"])
+        rule = _RULES.get(kind) or re.sub(r"^\w+ should ", "must ", fault["msg"])
         rule = rule.removeprefix("Value error, ")
     if isinstance(context.get("error"), OpenSecretError):
         return f"{key}: its value is not allowed, and not shown; {rule}"

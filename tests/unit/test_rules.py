@@ -37,6 +37,7 @@ def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
         ("topic: /bumper", "must have topic, condition_type and value"),
         ("topic: /a, condition_type: like, value: x", "'like' is not one of"),
         ("topic: /a, condition_type: above, value: 1", "needs field"),
+        ("topic: /a, condition_type: equals, value: [1]", "wrong.value: .1. .* must be a text"),
         ("kind: silent, topic: /a", "must have topic and for_s"),
         (f"kind: silent, for_s: 3, {BUMPER}", "must not have a condition"),
         ("kind: recorder_restart, topic: /a", "must have neither topic nor for_s"),
@@ -147,6 +148,8 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
         "{x: [5, 0], y: [0, 9]}",
         "{polygon: [[0, 0], [2, 0]]}",
         "{x: true, y: 1, radius_m: 1}",
+        "{x: [0, 1, 2], y: 1}",
+        "{polygon: [[0, 0, 0], [2, 0], [0, 2]]}",
         "{x: [0, '2'], y: [0, 1]}",
         "{polygon: [[0, 0], [2, 2], [5, 5], [1, 1]]}",
         "{x: 1, y: 1, radius_m: 1, polygon: [[0, 0], [2, 0], [0, 2]]}",
@@ -157,5 +160,7 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
     ],
 )
 def test_what_is_no_shape_is_refused(tmp_path: Path, shape: str) -> None:
-    with pytest.raises(ConfigError, match="places"):
+    with pytest.raises(ConfigError, match="places") as caught:
         places(tmp_path, f"places: {{dock: {shape}}}\n")
+    assert "\n" not in str(caught.value)
+    assert " should " not in str(caught.value)
