@@ -25,7 +25,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import duckdb
-from pyarrow import dataset, fs
+from pyarrow import dataset, fs, types
 
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -35,9 +35,10 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import abbreviate, shortened
+from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     import pyarrow as pa
 
@@ -103,7 +104,7 @@ class Selected(NamedTuple):
 
     Attributes:
         columns: the names of the columns.
-        rows: the values of each row as JSON; times are texts.
+        rows: the values of each row as JSON; times and lengths of time are texts.
         is_cut: whether there are more rows.
     """
 
@@ -236,8 +237,18 @@ class Select:
 
 
 def _rows_in(batch: pa.RecordBatch) -> Iterator[tuple[object, ...]]:
-    columns = (column.to_pylist(maps_as_pydicts="lossy") for column in batch.columns)
+    columns: list[Iterable[object]] = []
+    for column in batch.columns:
+        values = column.to_pylist(maps_as_pydicts="lossy")
+        columns.append(map(_duration, values) if types.is_interval(column.type) else values)
     return zip(*columns, strict=True)
+
+
+def _duration(value: pa.MonthDayNano | None) -> str | None:
+    """Returns the length of an interval as ISO 8601 has it, such as `P0M1DT2.5S`."""
+    if value is None:
+        return None
+    return f"P{value.months}M{value.days}DT{value.nanoseconds / NS_PER_S:.10g}S"
 
 
 def check_select(sql: str, tables: Collection[str], connection: duckdb.DuckDBPyConnection) -> None:

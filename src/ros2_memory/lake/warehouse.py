@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 _LOCK_FILE: Final = "writer.lock"
 _OWNER_FILE: Final = "writer.json"
 _ID_FILE: Final = "writer.id"
-_MAX_TEXT: Final = 1000
+_MAX_TEXT: Final = 1 << 16
 CATALOGUE_FILE: Final = "catalogue.sqlite"
 WRITTEN_FILE: Final = "written.jsonl"
 RECORD: Final = "ros2-memory.written"

@@ -103,10 +103,12 @@ def test_values_that_json_has_not_are_texts_and_longer_texts_are_marked(fleet: F
         fleet,
         "SELECT 1.5::DECIMAL(9, 2) AS dec, 'nan'::DOUBLE AS nan, DATE '2026-11-28' AS day,"
         " 'ab'::BLOB AS bytes, MAP {'k': 2} AS map, [1, NULL] AS list,"
+        " DATE '2026-11-28' + TIME '01:00' - DATE '2026-11-27' AS length,"
         " 'go to the kitchen now' AS text",
     )
-    values = [1.5, None, "2026-11-28", "6162", {"k": 2}, [1, None], "go to the kitchen now"]
-    assert answer["rows"] == [values]
+    *values, length, said = answer["rows"][0]
+    assert values == [1.5, None, "2026-11-28", "6162", {"k": 2}, [1, None]]
+    assert (length, said) == ("P0M1DT3600S", "go to the kitchen now")
     assert answer["quoted"] == ["rows.text"]
     twice = asked(fleet, "SELECT 1 AS n, 2 AS n")
     assert (twice["fields"], twice["rows"]) == (["n", "n"], [[1, 2]])

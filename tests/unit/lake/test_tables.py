@@ -328,6 +328,17 @@ def test_the_first_hub_keeps_the_lake_and_another_is_refused_until_it_is_given_u
         hub(tmp_path, "one").claim()
 
 
+def test_an_owner_whose_folder_has_a_long_name_of_other_letters_keeps_the_lake(
+    tmp_path: Path,
+) -> None:
+    """As JSON each of these letters takes six characters."""
+    far = tmp_path / ("機" * 80) / ("器" * 80)
+    far.mkdir(parents=True)
+    LakeLocation((tmp_path / "lake").as_uri(), far).claim()
+    with pytest.raises(LakeError, match="another writer"):
+        hub(tmp_path, "other").claim()
+
+
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"id": 5}'])
 def test_a_damaged_file_keeps_nobody_out(tmp_path: Path, owner_file: Path, text: str) -> None:
     owner_file.parent.mkdir(parents=True)
