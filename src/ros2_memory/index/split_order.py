@@ -148,9 +148,6 @@ def splits_before_set_ahead(
         far: the clock was also set where the next split begins so much later (ns).
     """
     starts, ends = timeline.starts, np.maximum(timeline.ends, 0)
-    has_hole = np.any(starts[1:] - np.maximum.accumulate(ends)[:-1] >= far)
-    if not set_ahead and not has_hole:
-        return {}
     bags, (order, apart) = timeline.bags, _in_series(timeline)
     before, after = order[:-1], order[1:]
     is_next = apart == 1

@@ -224,12 +224,20 @@ def damage_time(path: Path, was: int, becomes: int) -> None:
     path.write_bytes(content)
 
 
+@pytest.mark.parametrize("months_between", [0, 8])
 @pytest.mark.parametrize("is_split", [False, True])
-@pytest.mark.parametrize("wrong", [60 * S, BEGIN - 900 * DAY])
+@pytest.mark.parametrize("wrong", [60 * S, BEGIN - 200 * DAY])
 def test_what_was_recorded_before_the_clock_was_set_ahead_by_years_begins_no_memory(
-    tmp_path: Path, wrong: int, is_split: bool
+    tmp_path: Path, wrong: int, is_split: bool, months_between: int
 ) -> None:
-    """A computer without a battery dates its first messages by the day on which it was built."""
+    """A computer without a battery dates its first messages by the day on which it was built.
+
+    So it does at each start, also with months of other recordings behind that day.
+    """
+    for nth in range(months_between):
+        at = BEGIN - 190 * DAY + nth * 25 * DAY
+        others = [odom(at + n * S // 10, 1.0, 0.0) for n in range(20)]
+        write_mcap(tmp_path / f"month_{nth}" / f"month_{nth}_0.mcap", others)
     before = [wrong + n * S // 10 for n in range(100)]
     after = [BEGIN + n * S // 10 for n in range(200)]
     states = {at: text(at + 1000, "idle", topic="/mission") for at in (before[0], after[50])}
@@ -243,8 +251,10 @@ def test_what_was_recorded_before_the_clock_was_set_ahead_by_years_begins_no_mem
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", some)
     memory = memory_of(tmp_path)
     reply = asked(memory, "data_time_range")
-    assert (reply["earliest"], reply["latest"]) == (after[0] / S, after[-1] / S)
-    assert (reply["gaps"], reply["clock_steps"]) == ([], [])
+    earliest = BEGIN - 190 * DAY if months_between else after[0]
+    assert (reply["earliest"], reply["latest"]) == (earliest / S, after[-1] / S)
+    assert months_between or not reply["gaps"]
+    assert reply["clock_steps"] == []
     names = [fault["file"] for fault in reply["clock_faults"]]
     assert names == [f"rec/rec_{number}.mcap" for number in range(2 if is_split else 1)]
     assert all("the clock was set" in fault["reason"] for fault in reply["clock_faults"])
