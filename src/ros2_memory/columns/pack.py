@@ -254,7 +254,8 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
         data: `Packed.data`.
 
     Raises:
-        ValueError: there is no such codec, or the bytes are not of it.
+        ValueError, TypeError, LookupError, ArithmeticError, struct.error: there is no such codec,
+            or the bytes are not of it.
     """
     kind, _, rest = codec.partition(" ")
     if kind == "text":

@@ -448,7 +448,7 @@ class Scanner:
         try:
             data = decompress(stored) if stored else b""
             column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        except (ValueError, LookupError, struct.error) as error:
+        except (ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
             # Else each question about the part would fail, for ever.
             self._store_of_parts.give_up(error)
             raise GoneError from error
