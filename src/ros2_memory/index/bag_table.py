@@ -7,7 +7,9 @@ the two counts: within a folder, messages are not compared, so all of them would
 
 from __future__ import annotations
 
+import hashlib
 import os
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -29,13 +31,14 @@ from ros2_memory.index.timeline import Timeline
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_rows import BagRows, Bags
     from ros2_memory.storage.base import BagReader
 
 _BLOCK_BYTES: Final = 64 << 10
-"""Size of the blocks by which two bags are compared."""
+"""Size of the blocks by which bags are compared."""
 _BLOCKS: Final = 16
 """About how many blocks of a bag are compared."""
 
@@ -116,7 +119,7 @@ class BagTable:
         self._watched: set[str] = set()
         self._scanned: ScanResult | None = None
         self._timeline = Timeline()
-        self._compared: dict[tuple[BagFile, BagFile], bool] = {}
+        self._digests: dict[BagFile, bytes] = {}
 
     def update(self, context: ScanContext, *, patrolling: bool) -> TableChange:
         """Scans the directory and classifies the files that may have changed.
@@ -174,12 +177,18 @@ class BagTable:
         )
 
     def _copies(self) -> tuple[BagFile, ...]:
-        """Returns the bags that are copies of others in their folder; reads each pair once."""
-        compared, self._compared = self._compared, {}
-        for pair in _likely_copies(self._timeline):
-            with suppress(OSError):
-                self._compared[pair] = compared[pair] if pair in compared else _is_copy(*pair)
-        return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
+        """Returns the bags that are copies of others in their folder; reads each suspect once."""
+        known, self._digests = self._digests, {}
+        copies: list[BagFile] = []
+        for alike in _alike_bags(self._timeline):
+            originals: set[bytes] = set()
+            for bag in alike:
+                with suppress(OSError):
+                    digest = self._digests[bag] = known.get(bag) or _digest(bag)
+                    if digest in originals:
+                        copies.append(bag)
+                    originals.add(digest)
+        return tuple(copies)
 
     def _superseded(self) -> Iterable[BagFile]:
         """Returns the bags that thinned days replace.
@@ -393,37 +402,35 @@ def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
     return tuple(sorted(asides, key=lambda aside: aside.path))
 
 
-def _likely_copies(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
-    """Yields pairs of bags with equal folder, size and summary: the shorter name first."""
+def _alike_bags(timeline: Timeline) -> Iterator[list[BagFile]]:
+    """Yields the bags of one folder that have one size and one summary, the shortest name first."""
     starts = timeline.starts
     is_same = starts[1:] == starts[:-1]
     are_suspects = np.append(is_same, False) | np.append(False, is_same)
     edges = np.cumsum([len(segment.bags) for segment in timeline.segments])
     of_segments = zip(timeline.segments, np.split(are_suspects, edges), strict=False)
     suspects = chain.from_iterable(segment.bags.at(rows) for segment, rows in of_segments)
-    originals: dict[tuple[Path, int, int, int], BagFile] = {}
+    alike: defaultdict[tuple[Path, int, BagSummary], list[BagFile]] = defaultdict(list)
     for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
-        original = originals.setdefault((bag.recording, bag.size, bag.start, bag.end), bag)
-        if original is not bag and original.summary == bag.summary:
-            yield original, bag
+        alike[bag.recording, bag.size, bag.summary].append(bag)
+    return (bags for bags in alike.values() if len(bags) > 1)
 
 
-def _is_copy(original: BagFile, bag: BagFile) -> bool:
-    """Compares blocks spread over two bags of equal size.
+def _digest(bag: BagFile) -> bytes:
+    """Returns a digest of blocks spread over a bag.
 
     Equal times and sizes prove nothing: two runs of a simulation may have them.
 
     Raises:
-        OSError: one of them cannot be read.
+        OSError: it cannot be read.
     """
-    return _read_blocks(original) == _read_blocks(bag)
-
-
-def _read_blocks(bag: BagFile) -> list[bytes]:
     step = max(bag.size // _BLOCKS, _BLOCK_BYTES)
     offsets = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
+    digest = hashlib.blake2b()
     file = os.open(bag.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
-        return [os.pread(file, _BLOCK_BYTES, offset) for offset in offsets]
+        for offset in offsets:
+            digest.update(os.pread(file, _BLOCK_BYTES, offset))
     finally:
         os.close(file)
+    return digest.digest()

@@ -289,6 +289,22 @@ def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) ->
 
 
 @each_way
+def test_a_copy_of_the_second_of_two_runs_with_equal_times_counts_once(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As of a simulation: the copy is compared with both, not with the first alone."""
+    runs = [
+        write_odometry(tmp_path / "runs" / f"{name}.mcap", 0.1 + n) for n, name in enumerate("ab")
+    ]
+    assert runs[0].stat().st_size == runs[1].stat().st_size
+    shutil.copy2(runs[1], runs[1].with_name("b (copy).mcap"))
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert [bag.path for bag in memory.index.snapshot().bags] == runs
+    [odometry] = asked(memory, "list_recorded_topics")
+    assert odometry["count"] == 20
+
+
+@each_way
 def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
     tmp_path: Path, recalls: bool
 ) -> None:
