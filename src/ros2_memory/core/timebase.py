@@ -50,6 +50,7 @@ _MIDNIGHT: Final = re.compile(r"24(?::?00){1,2}")
 """The same without a date."""
 _BETWEEN_HOURS: Final = re.compile("-|to|and|,")
 _LONGEST_TIME: Final = 64
+_DATE_CHARS: Final = len("2026-11-20")
 _MINUTE_S: Final = 60.0
 _END_S: Final = 1.125e-6
 """How long before the next day, minute or second a written one ends: a query's end is granted a
@@ -255,9 +256,9 @@ def _written_span_s(written: str) -> float:
         return rest_of_text_s(written)
     if _MINUTES.search(written):
         return _MINUTE_S - _END_S
-    midnight = datetime.fromisoformat(written)
-    if (midnight.hour, midnight.minute) != (0, 0) or "T" in written.upper():
+    if len(written) > _DATE_CHARS:  # an hour
         return 0.0
+    midnight = datetime.fromisoformat(written)
     return (midnight + timedelta(days=1)).timestamp() - midnight.timestamp() - _END_S
 
 

@@ -29,8 +29,9 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     memory = memory_of(tmp_path)
     window = {"topic": "/chatter", "start": "2026-11-16", "end": "2026-11-18"}
     assert asked(memory, "get_topic_in_range", **window)["total"] == 4
-    window["end"] = "2026-11-18T00:00"
-    assert asked(memory, "get_topic_in_range", **window)["total"] == 2
+    for midnight in ("2026-11-18T00:00", "2026-11-18T00", "2026-11-18 00"):
+        window["end"] = midnight
+        assert asked(memory, "get_topic_in_range", **window)["total"] == 2
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
     found = asked(memory, "find_last_match", before="2026-11-18", **wanted)
     assert found["timestamp"] == hours[1] / NS_PER_S
