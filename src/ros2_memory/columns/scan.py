@@ -309,7 +309,7 @@ class Scan:
         is_apart = (last_before[begin] < first_from[begin]) & (last_before[end] < first_from[end])
         lasts = np.maximum(last_before[end], stops - 1)
         is_inside = (starts - beside >= window.start) & (lasts + beside < window.stop)
-        is_over = stops <= self.timeline.latest
+        is_over = starts <= self.timeline.latest - STRETCH_NS
         stretches = []
         for nth in np.flatnonzero(is_apart & is_inside & is_over).tolist():
             start, stop, last = int(starts[nth]), int(stops[nth]), int(lasts[nth])

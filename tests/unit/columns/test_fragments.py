@@ -20,7 +20,7 @@ from ros2_memory.columns.pack import compress
 from ros2_memory.columns.scan import Stretch
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
@@ -163,6 +163,20 @@ def test_what_was_made_in_time_is_told_before_the_time_is_over(
         found += (start for start, _ in joined_back(view, opened, WORDS, made))
     newest = next(one for one in opened.stretches() if one.parts is not None)
     assert found[-1] == newest.window.start
+
+
+def test_stretches_follow_each_other_up_to_a_message_dated_at_the_end_of_64_bits(
+    tmp_path: Path,
+) -> None:
+    write_mcap(tmp_path / "rec" / "0.mcap", driven(0))
+    write_mcap(tmp_path / "far" / "0.mcap", [replace(driven(0)[0], log_time=MAX_NS - 1)])
+    world = World.of(tmp_path)
+    world.fill()
+    stretches = open_scan(View(world.memory, Call()), "/odom", EVERYTHING).stretches()
+    edges = [EVERYTHING.stop, *(stretch.window.start for stretch in stretches)]
+    assert edges == sorted(edges, reverse=True)
+    assert [stretch.window.stop for stretch in stretches] == edges[:-1]
+    assert edges[-1] == EVERYTHING.start
 
 
 def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Path) -> None:
