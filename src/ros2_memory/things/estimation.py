@@ -53,6 +53,7 @@ from ros2_memory.things.synonyms import with_synonyms
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.core.timebase import Ns
 
@@ -280,6 +281,8 @@ def _link(group: LabelGroup, observed: Observations) -> list[Instance]:
     Once a label is known to be moved, a thing may also have left a place that nobody looked at, but
     not all of several that stand there.
     """
+    if not group.stays:
+        return []
     instances = _chain_stays(group, group.stays, proven=True)
     if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
         unproven = _chain_stays(group, group.stays, proven=False)
@@ -299,36 +302,44 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
     """
     instances: list[Instance] = []
     stays = sorted(stays, key=lambda stay: stay.firm_first)
-    seen_near = dict(zip(map(id, stays), _seen_near(stays), strict=True))
-    for stay in stays:
-        ended = [
-            instance
-            for instance in instances
-            if instance.stays[-1].firm_last <= stay.firm_first
-            and (
-                _has_ended(instance.stays[-1], stay)
-                or not (proven or instance.stays[-1].side_by_side > stay.side_by_side)
-            )
-        ]
-        if not ended:
+    seen_near = np.array([*_seen_near(stays)])
+    integers = [
+        (stay.first, stay.last, stay.firm_last, stay.place, stay.side_by_side) for stay in stays
+    ]
+    first, last, firm_last, place, beside = np.array(integers, np.int64).T
+    x, y, z = _middles(stays)
+    was_left = np.array([stay.left is not None for stay in stays])
+    newest = np.zeros(len(stays), np.int64)  # by thing, the number of its newest stay
+    for number, stay in enumerate(stays):
+        lasts = newest[: len(instances)]
+        is_near = np.hypot(x[lasts] - x[number], y[lasts] - y[number]) <= GATE_MM
+        is_near &= np.abs(z[lasts] - z[number]) <= STOREY_MM
+        # It was seen to end, or is so near that both would be seen together.
+        has_ended = was_left[lasts] | is_near & (last[lasts] <= first[number])
+        if not proven:
+            has_ended |= beside[lasts] <= beside[number]
+        ended = np.flatnonzero(has_ended & (firm_last[lasts] <= stay.firm_first))
+        thing = len(instances)
+        if len(ended):
+            rows = lasts[ended]
+            is_same, is_apart = place[rows] == stay.place, seen_near[rows] < stay.firm_first
+            order = np.lexsort((-ended, last[rows], is_apart, is_near[ended], is_same))
+            thing = int(ended[order[-1]])
+            instances[thing].stays.append(stay)
+        else:
             instances.append(Instance(group.key, group.epoch, [stay]))
-            continue
-        preferred = [
-            (
-                last.place == stay.place,
-                not _is_far(last, stay),
-                seen_near[id(last)] < stay.firm_first,
-                last.last,
-            )
-            for last in (instance.stays[-1] for instance in ended)
-        ]
-        ended[preferred.index(max(preferred))].stays.append(stay)
+        newest[thing] = number
     return instances
+
+
+def _middles(stays: Sequence[PlacedStay]) -> Floats:
+    """Returns x, y and z (mm) of stays: three rows."""
+    return np.array([(stay.x, stay.y, stay.z) for stay in stays]).T
 
 
 def _seen_near(stays: Sequence[PlacedStay]) -> Iterator[Ns]:
     """Yields for each stay when (ns) the newest stay near it began; it may be the stay itself."""
-    x, y, z = np.array([(stay.x, stay.y, stay.z) for stay in stays]).reshape(-1, 3).T
+    x, y, z = _middles(stays)
     begun = np.array([stay.firm_first for stay in stays], np.int64)
     by_x = stable_order(x)
     begins, ends = (np.searchsorted(x[by_x], x + reach) for reach in (-GATE_MM, GATE_MM))
@@ -339,52 +350,38 @@ def _seen_near(stays: Sequence[PlacedStay]) -> Iterator[Ns]:
         yield int(begun[beside[is_near]].max(initial=begun[nth]))
 
 
-def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:
-    """Whether a stay was seen to end, or is so near the next that both would be seen together."""
-    return last.left is not None or (last.last <= stay.first and not _is_far(last, stay))
-
-
 def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
     is_above = abs(one.z - other.z) > STOREY_MM
     return is_above or math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
 
 
 def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:
-    """Splits each stay in which another stay of the label lies between two sightings."""
+    """Splits each stay before the spots before which another stay of the label lies elsewhere.
+
+    None of its spots may be seen during the other stay.
+    """
     parts: list[PlacedStay] = []
+    firm_first, firm_last = bounds_of((stay.firm_first, stay.firm_last) for stay in stays)
+    place = np.array([stay.place for stay in stays])
     for stay in stays:
         observed.go_on()
-        firsts = observed.sights.spots[stay.spots, Spot.FIRST]
-        rows = stay.spots[stable_order(firsts)]
-        cuts = _cuts_around_others(stay, rows, stays, observed)
-        if not cuts:
+        rows = stay.spots[stable_order(observed.sights.spots[stay.spots, Spot.FIRST])]
+        first, last = (observed.sights.spots[rows, name] for name in (Spot.FIRST, Spot.LAST))
+        is_inside = (stay.firm_first < firm_first) & (firm_last < stay.firm_last)
+        is_inside &= place != stay.place
+        before = np.searchsorted(np.sort(last), firm_first[is_inside])
+        after = np.searchsorted(first, firm_last[is_inside], side="right")
+        is_between = (before == after) & (before > 0) & (after < len(rows))
+        cuts = np.unique(after[is_between])
+        if not len(cuts):
             parts.append(stay)
             continue
         whole = stay.stay._replace(firm_first=-1, firm_last=-1)
-        sizes = np.diff([0, *sorted(cuts), len(rows)])
+        sizes = np.diff([0, *cuts, len(rows)])
         split = placed_stays(observed, [whole] * len(sizes), rows, sizes)
         split[0].misread_as = stay.misread_as
         parts += split
     return parts
-
-
-def _cuts_around_others(
-    stay: PlacedStay, rows: Ints, stays: Sequence[PlacedStay], observed: Observations
-) -> set[int]:
-    """Returns before which of a stay's spots another stay at another place lies.
-
-    `rows` are the spots in order of time. None of them may be seen during the other stay.
-    """
-    first, last = (observed.sights.spots[rows, name] for name in (Spot.FIRST, Spot.LAST))
-    cuts = set()
-    for other in stays:
-        is_inside = stay.firm_first < other.firm_first and other.firm_last < stay.firm_last
-        if other.place == stay.place or not is_inside:
-            continue
-        before, after = last < other.firm_first, first > other.firm_last
-        if (before | after).all() and before.any() and after.any():
-            cuts.add(int(after.argmax()))
-    return cuts
 
 
 def _without_overlap(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:
@@ -411,17 +408,21 @@ def _add_poorly_localised(
     instances: Sequence[Instance], group: LabelGroup, observed: Observations
 ) -> None:
     """Adds to things the spots that were seen near them while localisation was poor."""
+    stays = [stay for instance in instances for stay in instance.stays]
     is_left_out = observed.poor[group.rows] & (len(observed.firm(group.rows)) < len(group.rows))
+    if not stays or not is_left_out.any():
+        return
+    sizes = np.array([len(instance.stays) for instance in instances])
+    begins, numbers = np.cumsum(sizes) - sizes, np.arange(len(stays))
+    first, (x, y, z) = np.array([stay.first for stay in stays]), _middles(stays)
     for row in group.rows[is_left_out].tolist():
         [spot] = observed.sights.spots[np.array([row])]
-        newest: list[PlacedStay] = []
-        for instance in instances:
-            begun = [stay for stay in instance.stays if stay.first <= spot[Spot.LAST]]
-            if begun and abs(begun[-1].z - spot[Spot.Z]) <= STOREY_MM:
-                newest.append(begun[-1])
-        away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in newest]
-        if away_mm and min(away_mm) <= GATE_MM:
-            stay = newest[away_mm.index(min(away_mm))]
+        newest = np.maximum.reduceat(np.where(first <= spot[Spot.LAST], numbers, -1), begins)
+        newest = newest[newest >= 0]
+        newest = newest[np.abs(z[newest] - spot[Spot.Z]) <= STOREY_MM]
+        away_mm = np.hypot(x[newest] - spot[Spot.X], y[newest] - spot[Spot.Y])
+        if away_mm.min(initial=math.inf) <= GATE_MM:
+            stay = stays[newest[away_mm.argmin()]]
             stay.spots = np.sort(np.append(stay.spots, row))
             stay.last = max(stay.last, int(spot[Spot.LAST]))
             stay.count += int(observed.counts[row])

@@ -1,9 +1,11 @@
 """Things by their sights alone: names, when one is missed, which looks count, usual places."""
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from types import FrameType
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -17,6 +19,7 @@ from ros2_memory.columns.table import Texts
 from ros2_memory.core.arrays import Columns, Ints
 from ros2_memory.core.model import Vector3
 from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.things import estimation
 from ros2_memory.things.estimation import estimate
 from ros2_memory.things.instances import Estimate, count_misses
 from ros2_memory.things.labels import Labels, moves_by_itself
@@ -129,6 +132,32 @@ def test_what_came_from_far_is_the_thing_that_is_not_seen_again_near_its_old_pla
     )
     places = [[round(stay.x / 10_000) for stay in thing.stays] for thing in found.instances]
     assert sorted(places) == [[0, 4], [2, 2]]
+
+
+def test_four_times_as_many_things_in_a_row_take_no_sixteen_times_the_work() -> None:
+    """As of the posts of a vineyard, all of which are elsewhere after the map was made anew."""
+
+    def work_on(things: int) -> int:
+        def pass_along(y: float) -> list[Seen]:
+            row = [((4.0 * nth, 0.0, 0.0), seen_at(4.0 * nth + 2, y)) for nth in range(things)]
+            return [seen for seen in row for _ in range(4)]
+
+        passes = [*pass_along(1.0) * 3, *pass_along(-0.8) * 3]
+        calls = 0
+
+        def count(frame: FrameType, event: str, _: object) -> None:
+            nonlocal calls
+            calls += event == "call" and frame.f_code.co_filename == estimation.__file__
+
+        sys.setprofile(count)
+        try:
+            found = estimated(*passes)
+        finally:
+            sys.setprofile(None)
+        assert [len(thing.stays) for thing in found.instances] == [2] * things
+        return calls
+
+    assert work_on(160) < 6 * work_on(40)
 
 
 @pytest.mark.parametrize(
