@@ -487,12 +487,13 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
     old_side = _Side(reader, old, old_cut, readable_bags(old, reader, only_closed=old in written))
     new_side = _Side(reader, new, new_cut, readable_bags(new, reader, only_closed=new in written))
-    ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
+    window = _compared_window(old_side, new_side)
+    lasting = old_side if is_void else new_side
     if lasting.recording in written and (
-        not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
+        not lasting.bags or (window is not None and lasting.end < window.stop - 1)
     ):
         return False
-    in_old, in_new = _miscounted(old_side, new_side, latched=is_void)
+    in_old, in_new = _miscounted(old_side, new_side, window, latched=is_void)
     count = len(in_old) + len(in_new)
     if count > MOST_LISTED:
         # Without a cut all messages of both recordings count.
@@ -509,14 +510,15 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     return True
 
 
-def _miscounted(old: _Side, new: _Side, *, latched: bool) -> tuple[list[_Copy], list[_Copy]]:
-    """Returns the messages of the old and of the new recording that the cut gets wrong.
+def _miscounted(
+    old: _Side, new: _Side, window: TimeWindow | None, *, latched: bool
+) -> tuple[list[_Copy], list[_Copy]]:
+    """Returns the messages of both recordings in a window that the cut gets wrong.
 
     `latched` includes latched messages. No cut applies to them, but a void recording hides them.
     """
     of_old: list[_Copy] = []
     of_new: list[_Copy] = []
-    window = _compared_window(old, new)
     if window is None:
         return of_old, of_new
     copies_in_old, copies_in_new = (side.copies(window, latched=latched) for side in (old, new))
@@ -532,10 +534,15 @@ def _miscounted(old: _Side, new: _Side, *, latched: bool) -> tuple[list[_Copy], 
 
 
 def _compared_window(old: _Side, new: _Side) -> TimeWindow | None:
-    """Returns the log times in which messages are compared; None if no message is hidden."""
+    """Returns the log times in which messages are compared; None if no message is hidden.
+
+    After a clock was set back, the log times that both recordings have may be hours: they ran side
+    by side in the first of these alone.
+    """
     spans = [*old.hidden(), *new.hidden()]
     if old.bags and new.bags:
-        first, last = max(old.start, new.start), min(old.end, new.end)
+        first = max(old.start, new.start)
+        last = min(old.end, new.end, first + LONGEST_NS)
         if first <= last:
             spans.append((first, last))
     if not spans:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import given, settings
@@ -399,6 +399,31 @@ def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_p
     new = cut_recording(tmp_path, "b", 0, 300, delay=0)
     interrupted(old, new)
     assert len(counted(tmp_path)) >= 20 + 2400
+
+
+def test_after_a_clock_that_was_set_back_a_minute_is_compared_and_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By dates the old recording has what the new one is about to record, ten minutes of it."""
+    for number, (start, stop) in enumerate([(0, 600), (0, 8)]):
+        messages = [bump(T0 + n * S // 10 + 1 - number, 0) for n in range(start * 10, stop * 10)]
+        write_mcap(tmp_path / "a" / f"a_{number}.mcap", messages)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [bump(T0 + n * S // 10, 9) for n in range(50, 1000)])
+    hand_over(tmp_path, 6)
+    old = read_handover(tmp_path / "a").handover
+    last = replace(old, end=Overlap(T0 + 6 * S, T0 + 38 * S, ("a_1.mcap",)))
+    write_handover(tmp_path / "a", last)
+    lengths, records = list[int](), McapReader.records
+
+    def noting(reader: McapReader, path: Path, topics: Any, window: TimeWindow, **how: Any) -> Any:
+        lengths.append(window.stop - window.start)
+        return records(reader, path, topics, window, **how)
+
+    monkeypatch.setattr(McapReader, "records", noting)
+    assert settle_handover(tmp_path / "a", tmp_path / "b", READER, {"b"})
+    assert 0 < max(lengths) <= 75 * S
+    monkeypatch.undo()
+    assert {*counted(tmp_path).values()} == {1}
 
 
 def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path: Path) -> None:
