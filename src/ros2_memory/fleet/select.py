@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.reply import with_notes
-from ros2_memory.core.text import listed, named, quote
-from ros2_memory.core.timebase import iso_local
+from ros2_memory.core.text import named, quote
+from ros2_memory.fleet.replies import shipped_to
+from ros2_memory.fleet.robots import LakeReport
 from ros2_memory.results import OfFleet
 from ros2_memory.tools.arguments import SelectArguments
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.lake.engine import Lake
@@ -68,7 +68,7 @@ def _answer(
     """
     del memory
     fleet.add_shipped()
-    names = {chosen.name for chosen in fleet.chosen(robot, call)}
+    names = [chosen.name for chosen in fleet.chosen(robot, call)]
     latest = lake.shipped_until(names)
     if not latest:
         raise NoDataError(NoDataReason.EMPTY_MEMORY, "nothing was shipped to the lake", ())
@@ -80,21 +80,10 @@ def _answer(
         [named(cell) if isinstance(cell, str) else quote(cell) for cell in row]
         for row in found.rows
     ]
-    notes = [_shipped_note(latest, names)]
+    notes = shipped_to({name: LakeReport(latest.get(name)) for name in names})
     more: JsonObject = {}
     if found.is_cut:
         more = {"more": True}
         do = "group them, select fewer columns, or raise limit (up to 1000)"
         notes.append(f"the first {len(rows)} rows: {do}")
     return OfFleet(with_notes({"fields": [*found.columns], "rows": rows, **more}, notes))
-
-
-def _shipped_note(latest: Mapping[str, Ns], names: Collection[str]) -> str:
-    """Returns the note on the times up to which the lake has robots, and on robots it lacks."""
-    least = min(latest, key=lambda name: latest[name])
-    first, last = latest[least], max(latest.values())
-    text = f"from the lake, which has what was shipped: {least} up to {iso_local(first) or first}"
-    if len(latest) > 1:
-        text += f", others up to {iso_local(last) or last} at most"
-    lacking = sorted({*names} - latest.keys())
-    return f"{text}; nothing of {listed(lacking)}" if lacking else text
