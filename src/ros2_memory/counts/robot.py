@@ -177,16 +177,8 @@ def count_visits(
     ]
     if by == "place":
         _add_visits_by_place(binned, [stays for _, stays in named_stays])
-        return binned.answer()
-    bins = len(binned.bins.names)
-    if len(named_stays) * bins > MOST_CELLS:
-        raise InvalidArgumentsError(
-            f"{len(named_stays)} places by {by} in {bins} bins are too many for one reply: name "
-            "one in where, or ask about a shorter window"
-        )
-    for name, stays in named_stays:
-        binned.add_counts(f"{name}.entries", _entry_times(stays))
-        binned.add_lengths(f"{name}.minutes", "minutes", [stay.span for stay in stays])
+    else:
+        _add_visits_of_each(binned, by, named_stays)
     return binned.answer()
 
 
@@ -216,6 +208,25 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
     binned.add("entries", "count", [*entries, *no_visits], sum(entries))
     binned.add("exits", "count", [*exits, *no_visits], sum(exits))
     binned.add("minutes", "minutes", [*lengths, *no_visits], sum(lengths))
+
+
+def _add_visits_of_each(
+    binned: BinnedWindow, by: By, named_stays: Sequence[tuple[str, Sequence[Stay]]]
+) -> None:
+    """Adds entries and minutes of each named place.
+
+    Raises:
+        InvalidArgumentsError: these are too many columns.
+    """
+    bins = len(binned.bins.names)
+    if len(named_stays) * bins > MOST_CELLS:
+        raise InvalidArgumentsError(
+            f"{len(named_stays)} places by {by} in {bins} bins are too many for one reply: name "
+            "one in where, or ask about a shorter window"
+        )
+    for name, stays in named_stays:
+        binned.add_counts(f"{name}.entries", _entry_times(stays))
+        binned.add_lengths(f"{name}.minutes", "minutes", [stay.span for stay in stays])
 
 
 def _entry_times(stays: Sequence[Stay]) -> Ints:
