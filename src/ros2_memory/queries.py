@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -275,46 +275,37 @@ def topic_range(
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
     read = _read_samples(view, picked, fields, window.start)
-    samples, decoded = read.samples, len(read.samples) + read.undecodable.total()
-    if read.unnamed and not decoded:
+    if not read.picked:
+        raise no_data_between(view, (name,), window)
+    if read.unnamed == read.picked:
         note_unnamed(view, name, [dict.fromkeys(fields)], window.stop)
         detail = f"the messages of {name} in this time say nothing of {listed(fields)}"
         raise with_notes(view, window, NoDataError(NoDataReason.BETWEEN_MESSAGES, detail))
-    if not decoded:
-        raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    if not samples:
+    if not read.samples:
         undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(read.undecodable)))
         raise with_notes(view, window, undecodable)
-    view.notes.add(*read.notes)
-    for why, count in read.undecodable.items():
-        view.notes.add(f"{count} samples left out: {why}")
-    if len(read.types) > 1:
-        view.notes.add(f"the topic was recorded under several types: {', '.join(read.types)}")
-    chosen = decoded + read.unnamed
-    if chosen < total:
-        view.notes.add(f"{chosen} of {total} samples, evenly spaced over the window")
-    if read.unnamed:
-        view.notes.add(f"{read.unnamed} samples left out: they say nothing of the fields")
-    note_unread(view, window, gaps=chosen < total)
+    _note_samples(view, read, total)
+    note_unread(view, window, gaps=read.picked < total)
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
     if fields:
-        note_unnamed(view, name, [sample.value for sample in samples], window.stop)
+        note_unnamed(view, name, [sample.value for sample in read.samples], window.stop)
     note_no_fix(view, name, window, fields)
     return results.TopicRange(
         name,
         [*read.types][-1],
         total,
-        tuple(samples),
+        tuple(read.samples),
         extremes,
         (*fields,),
         notes=view.notes.sentences(),
     )
 
 
-class _Samples(NamedTuple):
+@dataclass(slots=True)
+class _Samples:
     """Messages as replies show them, and how many were left out.
 
     Attributes:
@@ -323,13 +314,28 @@ class _Samples(NamedTuple):
         notes: on these messages alone.
         undecodable: how often each error kept a message from being decoded.
         unnamed: how many messages name other joints, as all do since the message before.
+        picked: how many messages there were.
     """
 
-    samples: list[Sample]
-    types: dict[str, None]
-    notes: list[str]
-    undecodable: Counter[str]
-    unnamed: int
+    samples: list[Sample] = field(default_factory=list)
+    types: dict[str, None] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    undecodable: Counter[str] = field(default_factory=Counter)
+    unnamed: int = 0
+    picked: int = 0
+
+
+def _note_samples(view: View, read: _Samples, total: int) -> None:
+    """Notes what samples leave out of all messages of a window."""
+    view.notes.add(*read.notes)
+    for why, count in read.undecodable.items():
+        view.notes.add(f"{count} samples left out: {why}")
+    if len(read.types) > 1:
+        view.notes.add(f"the topic was recorded under several types: {', '.join(read.types)}")
+    if read.picked < total:
+        view.notes.add(f"{read.picked} of {total} samples, evenly spaced over the window")
+    if read.unnamed:
+        view.notes.add(f"{read.unnamed} samples left out: they say nothing of the fields")
 
 
 def _read_samples(
@@ -344,13 +350,13 @@ def _read_samples(
     Raises:
         InvalidArgumentsError: no message has the fields.
     """
-    read = _Samples([], {}, [], Counter(), 0)
-    lacking, unnamed = Counter[str](), 0
+    read, lacking = _Samples(), Counter[str]()
     for message in messages:
+        read.picked += 1
         stating = newest_stating(view, message, fields, since)
         since = message.time + 1
         if stating is None:
-            unnamed += 1
+            read.unnamed += 1
             continue
         try:
             _, extracted = _decode_shown(view, stating, fields)
@@ -367,7 +373,7 @@ def _read_samples(
         if not read.samples:
             raise InvalidArgumentsError(detail)
         view.notes.add(f"{count} samples left out: {detail}")
-    return read._replace(unnamed=unnamed)
+    return read
 
 
 def position(
