@@ -126,8 +126,9 @@ from ros2_memory.things.unseen import notes_on_never
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.core.model import Geodetic
     from ros2_memory.extract import Extracted
     from ros2_memory.history.bag_access import StoredMessage
@@ -870,12 +871,7 @@ def trajectory_summary(
         note_runs(view, name, own_frame, window)
     view.notes.add(*axes_of(frame_id or own_frame))
     elapsed = view.elapsed_in(window)
-    # The least line has two ends: fewer waypoints are cut from it.
-    whole = with_runs(view, name, path, path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE)))
-    shown = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
-    if max_waypoints < _FEWEST_OF_A_LINE:
-        last = shown.waypoints[-1:] if max_waypoints else ()
-        shown = replace(shown, waypoints=last, waypoint_error_m=0.0)
+    shown = _drawn(view, name, path, elapsed, max_waypoints)
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, shown.waypoints, own_frame, frame_id)
         shown = replace(shown, waypoints=waypoints)
@@ -895,6 +891,19 @@ def trajectory_summary(
         away,
         notes=(*view.notes.sentences(), *_path_notes(shown, view.limits.max_plausible_speed_mps)),
     )
+
+
+def _drawn(
+    view: View, topic: str, path: PathSlice, elapsed: Elapsed, max_waypoints: int
+) -> Trajectory:
+    """Returns a path without steps of the clock, with at most so many waypoints."""
+    # The least line has two ends: fewer waypoints are cut from it.
+    whole = with_runs(view, topic, path, path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE)))
+    drawn = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
+    if max_waypoints >= _FEWEST_OF_A_LINE:
+        return drawn
+    last = drawn.waypoints[-1:] if max_waypoints else ()
+    return replace(drawn, waypoints=last, waypoint_error_m=0.0)
 
 
 def _path_notes(path: Trajectory, plausible_mps: float) -> Iterator[str]:
