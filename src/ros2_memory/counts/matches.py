@@ -467,14 +467,7 @@ def count_values(
     values = HeldValues(view, topic, field, asked="by value", until=asked.stop)
     start, end = shown_span(view.snapshot, asked)
     stop = end + 1
-    try:
-        held_values = values.during(start, stop)
-    except QueryTimeoutError as error:
-        held_values = values.known[::-1]
-        if not held_values:
-            raise
-        start = values.complete_since
-        view.notes.add_lack(f"only what is after {unix_text(start)} is counted: {error}")
+    held_values, start = _held_since(view, values, start, stop)
     if not held_values:
         raise no_data_between(view, (topic,), asked)
     view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held_values}))
@@ -502,6 +495,24 @@ def count_values(
         ),
         notes=view.notes.sentences(),
     )
+
+
+def _held_since(
+    view: View, values: HeldValues, start: Ns, stop: Ns
+) -> tuple[Sequence[HeldValue], Ns]:
+    """Returns the values of a time, and since when they are known; a note says if time ran out.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    try:
+        return values.during(start, stop), start
+    except QueryTimeoutError as error:
+        if not values.known:
+            raise
+        since = values.complete_since
+        view.notes.add_lack(f"only what is after {unix_text(since)} is counted: {error}")
+        return values.known[::-1], since
 
 
 def _value_rows(
