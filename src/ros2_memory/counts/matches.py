@@ -530,7 +530,8 @@ def _value_rows(
         first, last = times[0], times[-1]
         if first.is_blank or (condition and not condition.matches({"value": first.exact})):
             continue
-        text = first.value if isinstance(first.value, str) else json.dumps(first.value)
+        value = first.value
+        text = value if isinstance(value, str) else json.dumps(value)
         length = elapsed.among(without([(held.start, held.stop) for held in times], outside))
         row = _ValueRow(len(times), length, first.start, last.stop)
         rows.append((Quoted(shortened(text, _LONGEST_NAME)), row))
