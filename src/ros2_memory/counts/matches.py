@@ -260,28 +260,29 @@ def _label_held(
     if field and not all(_is_label(view, topic, field, binned.counted) for topic in topics):
         return None
     matches = condition.is_on
+    # What was in view just before the window does not begin in it.
     if scope.is_bounded or condition.min_score or len(topics) > 1:
-        seen = read_labels(view, topics, scope, condition, matches)
+        seen = read_labels(view, topics, scope.begun_before(FLICKER_NS), condition, matches)
         visible, since = seen.visible, seen.since
     else:
-        # What was in view just before the window does not begin in it.
         events, since = _events_in_order(view, topics[0], binned.counted.widened(FLICKER_NS))
         visible = _visible_by_events(events, matches)
         if visible.size:
             _note_uncounted(view, topics[0], events)
-    if not visible.size:
+    # Whether a message lay between two intervals is known only if both are of one label.
+    spans = united(
+        ((interval.first, interval.last) for interval in visible.intervals()), FLICKER_NS
+    )
+    counted = binned.counted
+    held = [(*span, span[0] >= counted.start) for span in spans if counted.overlaps(*span)]
+    if not held:
         return None
     texts = [topic for topic in topics if is_text(view, topic)]
     if texts:
         view.notes.add(
             f"{listed(texts)} has detections as JSON: by counts their labels, and no other texts"
         )
-    # Whether a message lay between two intervals is known only if both are of one label.
-    spans = united(
-        ((interval.first, interval.last) for interval in visible.intervals()), FLICKER_NS
-    )
-    start = binned.counted.start
-    return SightingSpans(held_spans((first, last, first >= start) for first, last in spans), since)
+    return SightingSpans(held_spans(held), since)
 
 
 def _is_label(view: View, topic: str, field: str, window: TimeWindow) -> bool:

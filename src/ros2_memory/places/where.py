@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import chain
 from operator import itemgetter
@@ -311,6 +312,19 @@ class Scope:
         mixed = note_robots(view, resolve_path_topic(view), window)
         known = placed_times(known_track.track, mixed)
         self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
+
+    def begun_before(self, by: Ns) -> Scope:
+        """Returns the scope of a window that begins `by` earlier.
+
+        Before this one the robot is in the place if it is there when this one begins.
+        """
+        earlier = copy(self)
+        start = self.window.start - by
+        earlier.window = replace(self.window, start=start)
+        if self._inside and self._inside[0][0] <= self.window.start:
+            (_, stop), *later = self._inside
+            earlier._inside = [(start, stop), *later]
+        return earlier
 
     @property
     def compared_frames(self) -> tuple[str, ...]:

@@ -431,6 +431,24 @@ def cups(at: int, *numbers: int) -> Msg:
 
 
 @each_way
+def test_a_thing_in_view_as_a_window_begins_does_not_begin_there_whatever_else_is_asked(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """With a score or a place that it had all the time it counted as come into view."""
+    seen = [detections((T + at) * S, ["cup"] if at < 40 else []) for at in range(60)]
+    poses = [odom((T + at) * S, 0.0, 0.0) for at in range(60)]
+    write_splits(tmp_path, [*seen, *poses], 20)
+    memory = memory_of(tmp_path, recalls=recalls)
+    sought = {"topic": "/vision/*/*", "condition_type": "contains", "value": "cup", "by": "hour"}
+    here: dict[str, Any] = {"where": {"x": [-1, 1], "y": [-1, 1]}}
+    for scope in ({}, {"min_score": 0.5}, here):
+        for start, count, seconds in ((20.5, 0, 18.5), (-5, 1, 39.0), (40.5, 0, 0.0)):
+            window = {"start": T + start, "end": T + 59}
+            whole = table(asked(memory, "find_matches", **sought, **window, **scope))["all"]
+            assert (whole["count"], whole["seconds"]) == (count, seconds)
+
+
+@each_way
 @pytest.mark.parametrize(
     ("write_seen", "field", "value"),
     [(tags, "detections.id", 7), (cups, "detections.label", "cup")],
