@@ -61,13 +61,13 @@ class _HourlyPlaces(NamedTuple):
 
     def place_shares(self, rows: Ints) -> Floats:
         """Returns the share of each place in the hours before each row; no share is 0."""
-        return _normalised(self._are_before(rows) @ self.are_at() + 1.0 / self.size)
+        return _normalised(self._sums_at_places(self._are_before(rows)) + 1.0 / self.size)
 
     def likely_by_hour(self, rows: Ints, hours: Floats) -> Floats:
         """Returns how likely each place is at an hour of the day, by the hours before each row."""
         apart = np.abs((self.hours - hours[:, None] + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
         weights = np.exp(-((apart / _AROUND_H) ** 2) / 2) * self._are_before(rows)
-        return _normalised(weights @ self.are_at() + self.place_shares(rows))
+        return _normalised(self._sums_at_places(weights) + self.place_shares(rows))
 
     def chances_to_stay(self, rows: Ints, ages_h: Floats) -> Floats:
         """Returns how likely a thing is still where it was, by the hours before each row.
@@ -101,10 +101,11 @@ class _HourlyPlaces(NamedTuple):
         """Returns which hours (columns) are before each row."""
         return np.arange(len(self.hours)) < rows[:, None]
 
-    def are_at(self) -> Floats:
-        """Returns 1 for each hour (row) and the place (column) where the thing was then, else 0."""
-        are_at: Floats = (self.places[:, None] == np.arange(self.size)).astype(np.float64)
-        return are_at
+    def _sums_at_places(self, weights: Floats | Flags) -> Floats:
+        """Returns for each row the sum of the weights of the hours (columns) at each place."""
+        cells = np.arange(len(weights))[:, None] * self.size + self.places
+        sums = np.bincount(cells.ravel(), weights.ravel(), len(weights) * self.size)
+        return sums.reshape(-1, self.size).astype(np.float64)
 
 
 def _normalised(weights: Floats) -> Floats:
@@ -190,9 +191,11 @@ def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
         rows = np.arange(begin, min(begin + _AT_ONCE, count))
         # A wrong place is off by 1, and so is the right one, which got nothing.
         error_of_last_place = 2.0 * (np.diff(hourly.places)[rows - 1] != 0)
+        earlier = hourly._replace(hours=hourly.hours[: rows[-1]], places=hourly.places[: rows[-1]])
+        are_there = hourly.places[rows, None] == np.arange(hourly.size)
         error, error_without_hours = (
-            ((likely - hourly.are_at()[rows]) ** 2).sum(axis=1)
-            for likely in hourly.predict(rows, hourly.hours[rows])
+            ((likely - are_there) ** 2).sum(axis=1)
+            for likely in earlier.predict(rows, hourly.hours[rows])
         )
         gains.append(np.stack((error_of_last_place - error, error_without_hours - error), axis=1))
     every = np.concatenate(gains)
