@@ -92,11 +92,13 @@ def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> T
     if not skipped or trajectory.poses < 2:
         return trajectory
     totals = trajectory.totals
-    usual_s = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
+    usual = (ns_from_unix(totals.duration_s) - totals.gap_ns) // (trajectory.poses - 1)
+    # Between two poses lie a step and the usual time.
+    longest = max(GAP_NS, GAP_PERIODS * usual) - usual
     counted_as_gaps = [
         stop - begin
         for begin, stop in elapsed.skipped
-        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > usual_s
+        if path.first <= begin and stop <= path.last and stop - begin > longest
     ]
     gaps = max(0, totals.gaps - len(counted_as_gaps))
     gap_ns = totals.gap_ns - sum(counted_as_gaps)

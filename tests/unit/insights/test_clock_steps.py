@@ -122,6 +122,25 @@ def test_what_the_clock_skipped_is_neither_recorded_nor_missing_nor_unknown(tmp_
         assert [step["step_s"] for step in within["clock_steps"]] == [pytest.approx(500, abs=0.1)]
 
 
+@pytest.mark.parametrize(("silent_s", "by"), [(5.0, 0.8), (120.0, 1.5)])
+def test_a_gap_in_the_poses_is_one_also_where_the_clock_was_set(
+    tmp_path: Path, silent_s: float, by: float
+) -> None:
+    """By less than makes a gap, or beside a pause that makes poses rare on average."""
+
+    def at_beat(t: float) -> Iterator[Msg]:
+        at, logged = (BEGIN * S + round((t + extra) * S) for extra in (0.0, by * (t > 139.95)))
+        if not 10 <= t < 10 + silent_s:
+            yield odom(at, SPEED * t, log_time=logged)
+        yield battery(at + 1000, 0.5, log_time=logged + 1)
+
+    memory = written(tmp_path, at_beat)
+    assert len(steps(memory)) == 1
+    driven = asked(memory, "trajectory_summary", start=BEGIN, end=BEGIN + 200)
+    assert driven["gap_m"] == pytest.approx(SPEED * silent_s, abs=0.11)
+    assert [note for note in driven["notes"] if note.startswith("1 gap without a pose")]
+
+
 def test_the_age_of_a_latched_value_is_without_what_the_clock_skipped(tmp_path: Path) -> None:
     messages = [text(BEGIN * S + 50 * S, "on", topic="/mode")]
     for beat in range(160 * HZ):
