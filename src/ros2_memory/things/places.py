@@ -23,8 +23,10 @@ from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.arrays import (
     Flags,
+    Groups,
     Ints,
     distinct_rows,
+    in_ranges,
     places_among,
     range_numbers,
     run_starts,
@@ -69,7 +71,7 @@ def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
     mass = np.bincount(cell_of, weight).astype(np.float64)
     centre = np.stack([np.bincount(cell_of, weight * axis) / mass for axis in (x, y)])
     order = stable_order(-_density(cells, mass))
-    spots = _Spots(stable_order(order)[cell_of], weight, slices)
+    spots = _Spots(Groups.of(stable_order(order)[cell_of]), weight, slices)
     place, least = np.full(len(x), -1, np.int64), np.full(len(x), np.inf)
     points = _Points(x, y)
     peaks = _peaks(centre[:, order], mass[order], spots)
@@ -98,19 +100,25 @@ class _Points:
 
 
 class _Spots(NamedTuple):
-    """The cell, the weight and the slice of each spot."""
+    """The weight and the slice of each spot, and the spots by their cell."""
 
-    cell: Ints
+    by_cell: Groups
     weight: Floats
     slice: Ints
 
     def share(self, cells: Ints, others: Ints) -> float:
         """Returns the weight in cells over that in others, while most of the former is seen."""
-        is_inside = np.isin(self.cell, cells)
-        first, last = np.percentile(self.slice[is_inside], MIDDLE)
-        weight = self.weight * ((self.slice >= first) & (self.slice <= last))
-        weight_of_others = weight[np.isin(self.cell, others)].sum()
-        return float(weight[is_inside].sum() / max(weight_of_others, 1.0))
+        own, beside = (self._in_cells(which) for which in (cells, others))
+        first, last = np.percentile(self.slice[own], MIDDLE)
+        weight, weight_of_others = (
+            self.weight[rows][(self.slice[rows] >= first) & (self.slice[rows] <= last)].sum()
+            for rows in (own, beside)
+        )
+        return float(weight / max(weight_of_others, 1.0))
+
+    def _in_cells(self, cells: Ints) -> Ints:
+        order, begins, sizes = self.by_cell
+        return order[in_ranges(begins[cells], sizes[cells])]
 
 
 class _Peak(NamedTuple):
