@@ -104,8 +104,8 @@ def find_things(
     known = known_things(view, lowest, window)
     view.notes.retract_outside(asked_window)
     note_other_frames(view, known, region)
-    wanted = {known.labels.key(label): label for label in labels}
     finder = _Finder(known, window, region, places_asked(limits, region, known.frames), now)
+    wanted = {known.labels.key(label): label for label in labels}
     found = sorted(finder.find(wanted), key=lambda thing: (-thing.last, thing.label, thing.place))
     if nearness is not None:
         landmarks = nearness.landmarks(finder)
@@ -117,12 +117,6 @@ def find_things(
     note_unread(view, asked_window, nothing=not found, gaps=not found)
     if not found and searched != asked_window:
         view.notes.add(describe_misdated(view.snapshot.misdated))
-    shown = tuple(finder.describe(thing) for thing in found[:limit])
-    last_stays = _last_stays(found[:limit])
-    view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
-    view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
-    view.notes.add(*lone_notes(known, _movers(found)))
-    totals = _totals(found)
     question = ThingsQuestion(
         labels=wanted,
         found=frozenset(key for thing in found for key in thing.keys),
@@ -133,13 +127,30 @@ def find_things(
         min_score=f"min_score {lowest:g}{' (data.min_score)' if min_score is None else ''}",
         undecoded=undecoded,
     )
+    return _described(view, finder, question, found, limit)
+
+
+def _described(
+    view: View,
+    finder: _Finder,
+    question: ThingsQuestion,
+    found: Sequence[_FoundThing],
+    limit: int,
+) -> Things:
+    """Returns the answer to a question, with at most `limit` of the things that were found."""
+    known, totals = finder.known, _totals(found)
+    shown = tuple(map(finder.describe, found[:limit]))
+    last_stays = _last_stays(found[:limit])
+    view.notes.add(*look_alike_notes(known, finder.moves(found[:limit])))
+    view.notes.add(*renamed_notes(known, (instance for instance, _ in last_stays)))
+    view.notes.add(*lone_notes(known, _movers(found)))
     return Things(
         frame_id=_frame_of(known, shown),
         things=shown,
         total=totals.total(),
         labels=tuple(sorted(totals.items())),
-        now=now,
-        all_counted=known.reaches_back(window),
+        now=finder.now,
+        all_counted=known.reaches_back(finder.window),
         notes=(
             *view.notes.sentences(),
             *notes_on(view, known.by_all, question),
