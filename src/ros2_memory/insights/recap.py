@@ -181,22 +181,10 @@ def recap(
     note_unread(view, window)
     note_edges(view, window)
     note_foxglove_logs(view, window)
-    counts = happened.counts
-    kinds = [kind for kind in counts if with_sights or kind != "thing"]
-    events = [event for event in happened.events if event.kind in kinds]
-    shown = _most_important(
-        view, events, Counter({kind: counts[kind] for kind in kinds}), most_events
-    )
+    shown = _shown_events(view, happened, drive, places, most=most_events, with_sights=with_sights)
     if with_changes:
         shown = _with_changes(changes_in(view, window, topics), shown)
-    shown = [
-        replace(
-            event,
-            places=_place_names(event, places),
-            skipped=drive.elapsed.skipped_between(event.start, event.end or event.start),
-        )
-        for event in shown
-    ]
+    counts = happened.counts
     answer = Recap(
         start=start,
         end=end,
@@ -265,6 +253,30 @@ def _what_happened(
     counts = Counter(event.kind for event in events)
     counts["thing"], counts["stop"] = things.total, len(stops)
     return _Happened(events, counts, things.throughout, things.longest_of_each)
+
+
+def _shown_events(
+    view: View,
+    happened: _Happened,
+    drive: Drive,
+    places: RobotPlaces | None,
+    *,
+    most: int,
+    with_sights: bool,
+) -> list[Event]:
+    """Returns the most important events, in order of time, with the places where the robot was."""
+    counts = happened.counts
+    kinds = [kind for kind in counts if with_sights or kind != "thing"]
+    events = [event for event in happened.events if event.kind in kinds]
+    shown = _most_important(view, events, Counter({kind: counts[kind] for kind in kinds}), most)
+    return [
+        replace(
+            event,
+            places=_place_names(event, places),
+            skipped=drive.elapsed.skipped_between(event.start, event.end or event.start),
+        )
+        for event in shown
+    ]
 
 
 def _standing_time(view: View, drive: Drive) -> Ns | None:
