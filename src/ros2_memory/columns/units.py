@@ -281,12 +281,11 @@ def copies_among(messages: Identities) -> Flags:
     columns = (column.tolist() for column in messages.rows(order))
     rows = zip(order.tolist(), *columns, strict=True)
     for row, time, published, payload, recording in rows:
-        while counted:
-            counted_at, message = counted[0]
-            if counted_at >= time - COPY_HORIZON_NS:
-                break
-            counted.popleft()
-            counts.pop(message, None)
+        while counted and counted[0][0] < time - COPY_HORIZON_NS:
+            _, message = counted.popleft()
+            left = {number: count - 1 for number, count in counts.pop(message).items() if count > 1}
+            if left:
+                counts[message] = left
         message = (published, payload)
         by_recording = counts.setdefault(message, {})
         most = max(by_recording.values(), default=0)

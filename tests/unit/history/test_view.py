@@ -170,6 +170,24 @@ def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_w
     assert reply["timestamp"] == T0 / S + 4
 
 
+@each_way
+def test_of_a_message_that_two_recordings_have_twice_each_one_copy_is_of_the_second(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The last one is 2.25 s after the first, whose copy was met, and 0.75 s after the second."""
+    for name, received_s in (("one", (0.0, 1.5)), ("two", (0.125, 2.25))):
+        sent = text(T0, "go")
+        received = [
+            replace(sent, log_time=T0 + round(at * S), publish_time=T0) for at in received_s
+        ]
+        begin, end = text(T0 - S, f"{name} begins"), text(T0 + 5 * S, f"{name} ends")
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [begin, *received, end])
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"topic": "/chatter", "start": T0 / S, "end": T0 / S + 4}
+    shown = asked(memory, "get_topic_in_range", **window)["samples"]
+    assert [sample["timestamp"] for sample in shown] == [T0 / S, T0 / S + 1.5]
+
+
 def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
     tmp_path: Path,
 ) -> None:
