@@ -264,7 +264,8 @@ class ReplyJson(ExactJson):
             return _whole_or_null(round(number, _METRIC_DECIMALS))
         if isinstance(number, Degrees):
             return _whole_or_null(round(number, _DEGREE_DECIMALS))
-        return round_single(number) if isinstance(number, np.float32) else round_real(number)
+        # A float of numpy warns of the remainder of infinity.
+        return round_single(number) if isinstance(number, np.float32) else round_real(float(number))
 
     def _seconds(self, time: Ns, /) -> JsonValue:
         return _whole_or_null(unix_rounded_up(time))

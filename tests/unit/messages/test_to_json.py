@@ -39,6 +39,7 @@ WIDTHS = (np.float16(0.5), np.longdouble(0.5), np.float64(0.5))
     ("node", "short", "whole"),
     [
         (math.nan, "null", "NaN"),
+        (np.float64(math.inf), "null", "Infinity"),
         (np.array([1.0, math.inf], dtype=np.float32), "[1, null]", "[1.0, Infinity]"),
         *((number, "0.5", "0.5") for number in WIDTHS),
         *((np.array([number]), "[0.5]", "[0.5]") for number in WIDTHS),
