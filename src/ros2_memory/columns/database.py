@@ -255,10 +255,11 @@ class Database:
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
-    def give_up(self, error: Exception) -> None:
-        """Sets the database aside, because data read from it turned out to be damaged."""
+    def give_up(self, row: int, error: Exception) -> None:
+        """Sets the database of a row aside, because data read of it turned out to be damaged."""
         with self._lock:
-            self._handle(error)
+            if self.is_current(row):  # else another thread has, and the present one is sound
+                self._handle(error)
 
     def write_again(self) -> None:
         """Writes nothing to a database that failed, to find out whether its disk works again.

@@ -450,7 +450,7 @@ class Scanner:
             column = unpack(packed.codec, packed.count, packed.zone.least, data)
         except (ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
             # Else each question about the part would fail, for ever.
-            self._store_of_parts.give_up(error)
+            self._store_of_parts.give_up(part, error)
             raise GoneError from error
         has_row_numbers = path == BAG or path.endswith("#")
         if has_row_numbers and not isinstance(column, Texts) and all(column.strides):

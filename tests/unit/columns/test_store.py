@@ -182,6 +182,14 @@ def test_a_column_that_turns_out_damaged_fails_one_question_and_no_other(
     assert check_all(world) == 4 * 24
 
 
+def test_two_questions_that_find_one_damage_set_one_file_aside(world: World) -> None:
+    part = world.store.parts("/odom")[0].number
+    world.store.give_up(part, ValueError("damaged"))
+    assert world.fill() == 4
+    world.store.give_up(part, ValueError("damaged"))
+    assert len(world.stored()) == 4
+
+
 def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir)
