@@ -116,10 +116,7 @@ class SummarySchema:
     @cached_property
     def positions(self) -> dict[str, tuple[int, ...]]:
         """The positions of each topic among `topics`: one for each of its types."""
-        positions: dict[str, tuple[int, ...]] = {}
-        for position, header in enumerate(self.topics):
-            positions[header.topic] = (*positions.get(header.topic, ()), position)
-        return positions
+        return _positions_of(self.topics)
 
     def to_json(self) -> str:
         """Returns the schema as JSON; equal schemas give equal texts."""
@@ -188,13 +185,27 @@ def set_back_while_written(by: Ns) -> str:
 
 @lru_cache(maxsize=_CACHED_SCHEMAS)
 def shared_schema(schema: SummarySchema) -> SummarySchema:
-    """Returns the one object for all equal schemas, with one object for each name."""
+    """Returns the one object for all equal schemas, with one object for all equal topics."""
+    topics, silent = _shared_headers(schema.topics), tuple(map(sys.intern, schema.silent))
+    return replace(schema, topics=topics, silent=silent)
+
+
+# Apart: bags with pauses or remarks have schemas of their own, and the same topics.
+@lru_cache(maxsize=_CACHED_SCHEMAS)
+def _shared_headers(topics: tuple[TopicHeader, ...]) -> tuple[TopicHeader, ...]:
     intern = sys.intern
-    topics = tuple(
+    return tuple(
         TopicHeader(intern(topic), intern(type_name), intern(encoding), latched)
-        for topic, type_name, encoding, latched in schema.topics
+        for topic, type_name, encoding, latched in topics
     )
-    return replace(schema, topics=topics, silent=tuple(map(intern, schema.silent)))
+
+
+@lru_cache(maxsize=_CACHED_SCHEMAS)
+def _positions_of(topics: tuple[TopicHeader, ...]) -> dict[str, tuple[int, ...]]:
+    positions: dict[str, tuple[int, ...]] = {}
+    for position, header in enumerate(topics):
+        positions[header.topic] = (*positions.get(header.topic, ()), position)
+    return positions
 
 
 @dataclass(frozen=True, slots=True)

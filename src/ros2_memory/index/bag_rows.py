@@ -160,9 +160,6 @@ class BagRows:
 
     def at(self, rows: Rows) -> Iterator[BagFile]:
         """Yields the bags in some rows."""
-        kinds = [
-            (schema, data, len(data) // len(members)) for schema, members, data in self.summaries
-        ]
         for file, kind, place, (size, mtime, sidecar, start, end, state) in zip(
             self.files(rows),
             self._kind_of[rows].tolist(),
@@ -170,7 +167,8 @@ class BagRows:
             self._numbers.T[rows].tolist(),
             strict=True,
         ):
-            schema, data, length = kinds[kind]
+            schema, members, data = self.summaries[kind]
+            length = len(data) // members.size
             summary = BagSummary(schema, data[place * length : (place + 1) * length])
             yield BagFile(file, size, mtime, _STATES[state], summary, start, end, sidecar)
 

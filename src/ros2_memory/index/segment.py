@@ -343,13 +343,15 @@ class Segment:
         # In memory all counts lie together, and all times: so they are added up quickly.
         numbers = np.empty((3, len(headers), len(self.bags)), np.int64).transpose(1, 2, 0)
         end = 0
+        # Many schemas differ in their pauses alone, and share their topics.
+        found: dict[int, tuple[list[int], list[int]]] = {}
         for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
-            position_of = {header: position for position, header in enumerate(schema.topics)}
-            rows = [row for row, header in enumerate(headers) if header in position_of]
+            if id(schema.topics) not in found:
+                found[id(schema.topics)] = _find_headers(headers, schema.topics)
+            rows, positions = found[id(schema.topics)]
             if len(rows) < len(headers):
                 numbers[:, begin:end] = _NO_MESSAGES
-            positions = [position_of[headers[row]] for row in rows]
             numbers[rows, begin:end] = numbers_of(schema, joined, bags.size, positions)
         return numbers
 
@@ -450,6 +452,15 @@ def wider(span: Span | None, other: Span) -> Span:
         return other
     (first, last), (other_first, other_last) = span, other
     return min(first, other_first), max(last, other_last)
+
+
+def _find_headers(
+    headers: Sequence[TopicHeader], topics: Sequence[TopicHeader]
+) -> tuple[list[int], list[int]]:
+    """Returns the rows of the headers that are among some topics, and their positions there."""
+    position_of = {header: position for position, header in enumerate(topics)}
+    rows = [row for row, header in enumerate(headers) if header in position_of]
+    return rows, [position_of[headers[row]] for row in rows]
 
 
 def _cut_at(

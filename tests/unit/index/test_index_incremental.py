@@ -276,6 +276,22 @@ def write_odometry(path: Path, speed: float, later: int = 0) -> Path:
 
 
 @each_way
+def test_bags_with_pauses_of_their_own_share_what_they_say_of_topics(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Else 6,000 bags of a robot that stalls in each take 30 MB in place of 10, and gaps 8 s."""
+    for split in range(2):
+        begin = (1_784_000_000 + 10 * split) * S
+        poses = [odom(begin + n * S // 10, 0.0) for n in range(90) if not 20 < n < 40 + split]
+        write_mcap(tmp_path / "rec" / f"rec_{split}.mcap", poses)
+    timeline = memory_of(tmp_path, recalls=recalls).index.snapshot().timeline
+    one, other = (bag.summary.schema for bag in timeline.bags)
+    assert one.pauses != other.pauses
+    assert one.topics is other.topics
+    assert one.positions is other.positions
+
+
+@each_way
 def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) -> None:
     path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
     for name in ("rec_0 (copy).mcap", "another.mcap"):
