@@ -139,9 +139,22 @@ class IntervalTable(NamedTuple):
         rows["label"], labels = sorted_codes(rows["label"], self.labels)
         return IntervalTable(labels, rows.tobytes())
 
-    def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
-        """Returns the longest intervals, the longest first; of equal ones the earliest first."""
-        return self._select(self._by_length()[:at_most]).intervals()
+    def most_telling(self, at_most: int) -> list[tuple[VisibleInterval, int]]:
+        """Returns the longest interval of each label, then those of rare labels, then the others.
+
+        Of equally rare ones the longest comes first. Beside each is how many are as rare: as many
+        as there are labels, or as its label has intervals if these are more.
+        """
+        by_length = self._by_length()
+        label = self._array["label"][by_length]
+        _, firsts, nth, sizes = np.unique(
+            label, return_index=True, return_inverse=True, return_counts=True
+        )
+        often = np.maximum(sizes, len(sizes))[nth]
+        often[firsts] = len(sizes)
+        order = stable_order(often)[:at_most]
+        intervals = self._select(by_length[order]).intervals()
+        return [*zip(intervals, often[order].tolist(), strict=True)]
 
     def longest_of_each(self) -> IntervalTable:
         """Returns the longest interval of each label; of equally long ones the earliest."""
