@@ -115,6 +115,7 @@ def note_unread(
         notes.add_lack(f"{OWN_FOLDER} cannot be read: what was lost or deleted is not known")
     absent = _absent_files(view) if must_be_complete else ()
     notes.add(*_describe_unread(snapshot, window, absent, nothing=nothing))
+    notes.add(*_describe_undated(view, window))
     _note_odd(view, window)
 
 
@@ -154,6 +155,14 @@ def _describe_unread(
     faults = [fault for fault in snapshot.misdated if fault.reaches_into(window)]
     if faults and not nothing:
         yield describe_misdated(faults)
+
+
+def _describe_undated(view: View, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence if gaps of a window may be when bags that a wrong clock dated were made."""
+    snapshot = view.snapshot
+    faults = [fault for fault in snapshot.misdated if fault.may_be_of(window)]
+    if faults and any(is_missed(snapshot, window, *gap) for gap in view.gaps(window)):
+        yield describe_misdated(faults, " may be of this time")
 
 
 def _are_losses_hidden(bag_dir: Path) -> bool:
@@ -571,10 +580,11 @@ def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
     )
 
 
-def describe_misdated(faults: Sequence[ClockFault]) -> str:
+def describe_misdated(faults: Sequence[ClockFault], what: str = "") -> str:
     """Returns the sentence on bags that a wrong clock dated; the last ones are named."""
     names = [f"{short_name(fault.bag.path)} ({fault.description})" for fault in faults[-MAX_NAMED:]]
-    return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
+    bags = f"{counted(len(faults), 'bag')} dated by a wrong clock{what}"
+    return f"{bags}: {listed(names, len(faults))}"
 
 
 def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | None:

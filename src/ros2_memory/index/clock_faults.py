@@ -55,6 +55,10 @@ class FaultyClock(StrEnum):
     STRAY = "stray"
 
 
+_UNDATED: Final = frozenset({FaultyClock.UNSET, FaultyClock.AHEAD, FaultyClock.SET_AHEAD})
+"""Where the true dates of a bag are known by its file, or by how far the clock was set, at best."""
+
+
 class ClockFault(NamedTuple):
     """A bag that a wrong clock dated.
 
@@ -89,6 +93,15 @@ class ClockFault(NamedTuple):
     def reaches_into(self, window: TimeWindow) -> bool:
         """Returns whether the times that the wrong clock gave overlap a window."""
         return window.overlaps(*self.span)
+
+    def may_be_of(self, window: TimeWindow) -> bool:
+        """Returns whether the bag may be of a window that its dates do not reach."""
+        start, _ = window.asked()
+        if self.kind not in _UNDATED or not self.misleads or self.reaches_into(window):
+            return False
+        if self.kind is FaultyClock.SET_AHEAD:
+            return window.overlaps(*(at + self.by for at in self.span))
+        return start <= self.bag.mtime_ns or self.bag.mtime_ns < FIRST_BAGS_NS
 
     @property
     def at(self) -> Ns:

@@ -380,6 +380,30 @@ def test_a_time_of_a_wrong_clock_is_recorded_as_any_other(tmp_path: Path) -> Non
     assert "recorded only" not in str(asked(memory, "recap", **unset))
 
 
+def test_a_gap_in_which_a_robot_may_have_driven_with_a_wrong_clock_says_so(tmp_path: Path) -> None:
+    """Of the second day: what its file was made on, two hours after the rightly dated drive."""
+    day = 86_400
+    for nth in range(3):
+        poses = along_x((T0_S + nth * day) * S, 60)
+        write_mcap(tmp_path / f"day{nth}" / f"day{nth}_0.mcap", poses)
+    boot = tmp_path / "boot" / "boot_0.mcap"
+    write_mcap(boot, along_x(20 * S, 60))
+    os.utime(boot, (T0_S + day + 7_200,) * 2)
+    memory = memory_of(tmp_path)
+
+    def is_noted(tool: str, begin: float, end: float, **arguments: object) -> bool:
+        told = asked(memory, tool, start=T0_S + begin, end=T0_S + end, **arguments)
+        note = "1 bag dated by a wrong clock may be of this time: boot/boot_0.mcap"
+        return note in str(told.get("notes"))
+
+    for tool in ("trajectory_summary", "recap"):
+        assert is_noted(tool, day, 2 * day - 10)
+        assert not is_noted(tool, day + 5, day + 50)
+        assert not is_noted(tool, day + 7_300, 3 * day)
+    assert is_noted("trajectory_summary", 0, 3 * day, by="day")
+    assert is_noted("trajectory_summary", day + 3_600, day + 3_700)
+
+
 @each_way
 def test_what_a_topic_reports_that_was_not_recorded_in_a_time_is_unknown_then_not_zero(
     tmp_path: Path, recalls: bool

@@ -359,6 +359,8 @@ def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> No
     assert warned(memory) == []
     path = asked(memory, "trajectory_summary", start=0, end=70)
     assert "as after a clock was set back" in str(path["notes"])
+    for tool in ("find_things", "memory_status"):
+        assert "as after a clock was set back" not in str(asked(memory, tool))
 
 
 def test_a_frame_with_two_parents_is_two_robots_until_a_recording_is_replaced_or_grows(
