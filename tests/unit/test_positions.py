@@ -209,6 +209,10 @@ def localised(n: int, topic: str) -> Msg:
     [
         (["/amr7/odom"], ["/amr7/amcl_pose"], True),
         (["/base_controller/odom"], ["/amcl_pose"], True),
+        (["/odometry/filtered"], ["/odometry/global", "/odometry/gps"], True),
+        (["/r1/odometry/local"], ["/r1/odometry/global"], True),
+        (["/odometry/filtered", "/odometry/local"], [], False),
+        (["/r1/odometry/filtered"], ["/r2/amcl_pose"], False),
         (["/r1/odom"], ["/r2/amcl_pose"], False),
         (["/r1/odom", "/r2/odom"], ["/r1/amcl_pose"], False),
         (["/amr7/wheels"], ["/amr7/amcl_pose"], False),

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 GIVE_TOPIC: Final = "give topic where the tool takes it"
 _DEFAULT_POSES: Final = "/odom"
 """The default of `data.pose_topic`."""
+_ODOMETRY: Final = (_DEFAULT_POSES, "/odometry/filtered", "/odometry/local")
+"""The ends of names of odometry, also of the package robot_localization."""
 _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
 """Matches names of topics whose poses are not the robot's."""
 _MOST_TRIED: Final = 20
@@ -78,7 +80,7 @@ def resolve_topic(view: View, name: str) -> str:
 def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False) -> str | None:
     """Returns the only topic with the robot's poses, if `data.pose_topic` is not recorded.
 
-    Of several topics it is the only `odom` in a namespace, if the others are of the same robot.
+    Of several topics it is the only odometry in a namespace, if the others are of the same robot.
     With `degrees`, the only topic of a satellite receiver if no topic has poses. None if there is
     more than one topic, or if somebody set `data.pose_topic`.
     """
@@ -94,11 +96,11 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
 
 
 def _odometry_of_one_robot(topics: Sequence[str]) -> list[str]:
-    """Returns the `odom` topics if all topics are in their namespace, or in none."""
-    named = [topic for topic in topics if topic.endswith(_DEFAULT_POSES)]
-    spaces = tuple(topic.removesuffix(_DEFAULT_POSES) + "/" for topic in named)
+    """Returns the odometry if all topics are in its namespace, or in none."""
+    named = {topic: end for topic in topics for end in _ODOMETRY if topic.endswith(end)}
+    spaces = tuple(topic.removesuffix(end) + "/" for topic, end in named.items())
     are_of_one = all(topic.startswith(spaces) or topic.rfind("/") <= 0 for topic in topics)
-    return named if are_of_one else []
+    return [*named] if are_of_one else []
 
 
 def topics_of_robot(view: View, what: str) -> list[str]:
