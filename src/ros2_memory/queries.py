@@ -49,6 +49,7 @@ from ros2_memory.history.coverage import (
     describe_gaps,
     describe_misdated,
     describe_odd,
+    is_whole,
     not_covered,
     note_edges,
     note_unread,
@@ -809,7 +810,8 @@ def _note_bags(view: View) -> None:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
-    odd += memory.scanner.damaged_parts(snapshot.bags)
+    found = memory.scanner.damaged_parts(snapshot.bags)
+    odd += [(bag, fault) for bag, fault in found if fault not in bag.summary.notes]
     view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
     thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
     if thinned and (since is None or thinned[0].start < since):
@@ -867,7 +869,7 @@ def trajectory_summary(
     require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
-    if frame_id in {None, own_frame}:
+    if (max_waypoints or farthest is not None) and frame_id in {None, own_frame}:
         note_runs(view, name, own_frame, window)
     view.notes.add(*axes_of(frame_id or own_frame))
     elapsed = view.elapsed_in(window)
@@ -1125,10 +1127,10 @@ def _as_value(
 
 
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
-    """Returns the notes on topics with odd bags, or with bags that a wrong clock dated."""
+    """Returns the notes on topics of bags that may lack messages, or that a wrong clock dated."""
     odd: dict[str, list[BagFile]] = {}
     for bag in snapshot.timeline.faulty(TimeWindow.everything()):
-        for topic in _topics_of(bag):
+        for topic in () if is_whole(bag) else _topics_of(bag):
             odd.setdefault(topic, []).append(bag)
     misdated: dict[str, list[ClockFault]] = {}
     for fault in snapshot.misdated:

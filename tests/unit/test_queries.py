@@ -51,7 +51,7 @@ def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: P
     assert inside.notes == ()
     wider = queries.topic_range(memory, Call(), "/odom", span(-5, 900))
     assert [note.partition(" at ")[0] for note in wider.notes] == [
-        f"recorded only 2 of 905 s between {T0 // S - 5}.000000 and {T0 // S + 900}.000000",
+        "recorded only 2 of 905 s",
         "the memory begins",
         "the memory ends",
     ]

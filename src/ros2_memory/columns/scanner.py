@@ -28,7 +28,6 @@ from ros2_memory.columns.stored import (
 from ros2_memory.columns.table import Column, Table, Texts, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.writing import BAG, LOG_TIME
-from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.store import ColumnStore, PartHead, State
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.transforms import Pair
+    from ros2_memory.core.errors import BagError
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray, Mask
@@ -201,15 +201,15 @@ class Scanner:
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
 
     def met_damage(self, bag: BagFile, error: BagError) -> None:
-        """Remembers the error if a part of a bag is lost: only reading the bag finds that out."""
-        if error.lost is None or isinstance(error, BagContradictionError):
+        """Remembers what is wrong with a part of a bag: only reading the bag finds that out."""
+        if error.lost is None:
             return
         if len(self._damaged) >= _MOST_DAMAGED:
             self._damaged.clear()
         self._damaged[bag.identity] = error.reason
 
     def damaged_parts(self, bags: Iterable[BagFile]) -> list[tuple[BagFile, str]]:
-        """Returns the bags of which a part was found lost since the program began, and why."""
+        """Returns the bags of which a part was found damaged since the program began, and how."""
         if not self._damaged:  # else no bag's identity is needed
             return []
         damaged = self._damaged

@@ -104,6 +104,11 @@ class SummarySchema:
         return (*self.notes, set_back_while_written(by))
 
     @cached_property
+    def faults(self) -> tuple[str, ...]:
+        """The remarks but for an early end."""
+        return tuple(remark for remark in self.remarks if not remark.startswith(ENDS_EARLY))
+
+    @cached_property
     def is_damaged(self) -> bool:
         """Whether the file is known as damaged: then its times may be, too."""
         return any(_DAMAGED in note for note in self.notes)
@@ -144,6 +149,8 @@ _DAMAGED: Final = "damaged"
 WRONG_STATISTICS: Final = "its own statistics are wrong"
 READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
 MESSAGES_MISSING: Final = "messages may be missing"
+NONE_LOST: Final = "none is lost"
+ENDS_EARLY: Final = "the file ends early"
 DOUBTS: Final = (
     WRONG_STATISTICS,
     "its summary section ",

@@ -31,7 +31,6 @@ from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.history.coverage import (
-    note_edges,
     note_unread,
     recording_gaps,
     shown_span,
@@ -528,7 +527,6 @@ class BinnedWindow:
             *self._columns,
         ]
         note_unread(self.view, self.asked)
-        note_edges(self.view, self.asked)
         cells = zip(*(column.values for column in columns), strict=True)
         rows = [*zip(self.bins.names, cells, strict=True)]
         if self._since is not None:

@@ -30,7 +30,7 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.text import Reason, listed, named
 from ros2_memory.counts.bins import HELD_COLUMNS
 from ros2_memory.history.context import READING_S, Note
-from ros2_memory.history.coverage import note_edges, note_unread, seconds, shown_span, unix_text
+from ros2_memory.history.coverage import note_unread, seconds, shown_span, unix_text
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.robots import note_robots_on
@@ -145,7 +145,6 @@ def count_labels(
     rows = _label_rows(seen, elapsed)
     note_robots_on(view, topics, window)
     note_unread(view, asked, nothing=not rows, search=True)
-    note_edges(view, asked)
     _note_labels(view, topics, elapsed.among(scope.unknown), len(rows))
     start, end = shown_span(view.snapshot, asked)
     return Bins(

@@ -38,7 +38,6 @@ from ros2_memory.history.condition_hints import names_of_numbers
 from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import (
-    note_edges,
     note_unread,
     recording_gaps,
     shown_span,
@@ -478,7 +477,6 @@ def count_values(
         more = counted(len(named_rows) - _MOST_VALUES, "value")
         view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")
     note_unread(view, asked)
-    note_edges(view, asked)
     note_robots(view, topic, asked)
     rows = [row for _, row in named_rows]
     return Bins(

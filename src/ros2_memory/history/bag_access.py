@@ -44,7 +44,6 @@ _AWAY: Final = Reason(
     "bag",
     many="could not be read, as their disk has been unmounted",
 )
-_CONTRADICTS_ITSELF: Final = Reason("contradicts itself", "bag", many="contradict themselves")
 _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
 
@@ -250,12 +249,9 @@ class BagAccess:
         if isinstance(error, BagVanishedError):
             is_away = any(aside.path in bag.path.parents for aside in self.snapshot.damaged)
             kind, reason = _AWAY if is_away else _DELETED, ""
-        elif isinstance(error, BagContradictionError):
-            kind, lost = _CONTRADICTS_ITSELF, (bag.start, bag.end)
-        if window.overlaps(*lost):
-            # All messages of a bag that contradicts itself were read.
-            self.notes.complete &= kind is _CONTRADICTS_ITSELF
-            self.notes.add(Note(kind, bag.file, reason, *lost))
+        # All messages of a bag that contradicts itself were read.
+        if window.overlaps(*lost) and not isinstance(error, BagContradictionError):
+            self.notes.add_lack(Note(kind, bag.file, reason, *lost))
 
     def read(
         self,

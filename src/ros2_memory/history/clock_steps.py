@@ -88,7 +88,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
         else:
             note = (
                 f"the clock was set back by {seconds(-by)} or more at {when}: durations across "
-                "that may be too short by as much, or too long if it was put right again"
+                "that may be wrong by as much"
             )
         view.notes.add(note)
     return Elapsed(steps)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Schema
 
-_ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
+_ELSEWHERE: Final = "for another frame, such as the map, ask visits, or give where"
 _INTEGER: Final = r"(?:u?int[0-9]+|byte|char|octet|(?:unsigned[ \t]+)?(?:short|long))"
 _CONSTANT: Final = re.compile(
     rf"^[ \t]*(?:const[ \t]+)?{_INTEGER}[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)"
@@ -153,8 +153,8 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
         return ()
     axes = "x and y" if condition.test.z is None else "x, y and z"
     note = (
-        f"near_position compared {axes} (within {condition.test.tolerance_m:g} m) in the frame of "
-        f"each message: {listed(named)}; {_ELSEWHERE}"
+        f"near_position compared {axes} within {condition.test.tolerance_m:g} m in "
+        f"{listed(named)}; {_ELSEWHERE}"
     )
     return (note,)
 

@@ -475,17 +475,6 @@ class Notes:
         """Records that sentences have reported the remarks of these bags' summaries."""
         self._remarks |= {bag.file: bag.summary.remarks for bag in bags}
 
-    def notes_cover_remarks(self, bag: BagFile) -> bool:
-        """Returns whether the notes on a bag report all remarks of its summary.
-
-        False if a sentence reported them (`add_remarks`): it replaces the notes.
-        """
-        if bag.file in self._remarks:
-            return False
-        own = [note for note in self._notes if note.file == bag.file]
-        details = {note.detail for note in _farthest(own)}
-        return details.issuperset(bag.summary.remarks)
-
     def so_far(self) -> frozenset[Note]:
         """Returns all notes, for `retract_outside`."""
         return frozenset(self._notes)

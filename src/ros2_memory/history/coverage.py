@@ -39,6 +39,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,
+    NONE_LOST,
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
@@ -120,17 +121,10 @@ def note_unread(
 
 
 def _note_odd(view: View, window: TimeWindow) -> None:
-    """Notes the bags of a window that are not whole, unless notes on reading them did."""
-    odd = [
-        bag
-        for bag in view.timeline.faulty(window)
-        # No other note says that a crash left a bag open.
-        if bag.state is BagState.INCOMPLETE or not view.notes.notes_cover_remarks(bag)
-    ]
+    """Notes the bags of a window that may lack messages, in place of notes on reading them."""
+    odd = [bag for bag in view.timeline.faulty(window) if not is_whole(bag)]
     view.notes.add(*describe_odd(odd))
-    # With more kinds of remarks, the sentences do not have every remark.
-    if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
-        view.notes.add_remarks(odd)
+    view.notes.add_remarks(odd)
 
 
 def _describe_unread(
@@ -141,11 +135,8 @@ def _describe_unread(
     `nothing`: whether the answer is that there is nothing.
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
-        names = [
-            f"{short_name(aside.path)} ({shortened(aside.reason)})" for aside in lost[-MAX_NAMED:]
-        ]
-        files = counted(len(lost), "bag file")
-        yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
+        files = _newest([(aside.path, aside.reason) for aside in lost])
+        yield f"could not be read and may hold more: {files}"
     active = being_written(snapshot, window, nothing=nothing)
     # Splits are not served before they were searched.
     if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:
@@ -257,7 +248,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
         return
     gone = united([*deleted_spans(bag_dir), *excluded_spans(bag_dir)])
     absent = _absent_files(view)
-    texts = defaultdict[tuple[str, str], list[str]](list)
+    found = defaultdict[tuple[str, str], Spans](list)
     for part in chain.from_iterable(_unrecorded_parts(snapshot, gap, gone) for gap in gaps):
         first, last = part
         inside = TimeWindow(first + 1, last)
@@ -270,11 +261,16 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
                 continue
             if window.overlaps(start, end) and (cause or is_unexplained_noted):
                 what = "could be read" if is_unread and not cause else "was recorded"
-                texts[cause, what].append(span_text(start, end))
-    for (cause, what), spans in texts.items():
-        named = listed(spans[-MAX_NAMED:], len(spans))
+                found[cause, what].append((start, end))
+    for (cause, what), spans in found.items():
+        longest = max(spans, key=lambda span: span[1] - span[0])
+        times = f"from {span_text(*longest)}"
+        if len(spans) > 1:
+            lengths = (min(end, window.stop) - max(start, window.start) for start, end in spans)
+            all_of_it = seconds(sum(lengths))
+            times = f"{len(spans)} times ({all_of_it}), the longest {times}"
         because = f", because {INTERRUPTIONS[cause]}" if cause else ""
-        yield f"nothing {what} from {named}{because}"
+        yield f"nothing {what} {times}{because}"
 
 
 def _split_by_cause(
@@ -469,13 +465,14 @@ def _absent_files(view: View) -> Sequence[SetAside]:
 
 def is_whole(bag: BagFile) -> bool:
     """Whether all messages of a bag with notes could be read."""
-    if bag.state is BagState.INCOMPLETE:
+    notes = bag.summary.notes
+    if bag.state is BagState.INCOMPLETE and not notes:
         return False
-    for note in bag.summary.notes:
+    for note in notes:
         if note.startswith(DOUBTS):
             is_harmless = not note.endswith(MESSAGES_MISSING)
         else:
-            is_harmless = note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
+            is_harmless = note.endswith((READ_WITHOUT_INDEXES, NONE_LOST)) or note == LOG_CLOCK_NOTE
         if not is_harmless:
             return False
     return True
@@ -561,30 +558,31 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
 
 
 def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
-    """Yields sentences on bags that are not whole, or that contradict themselves."""
-    remarked = [(bag, "; ".join(bag.summary.remarks)) for bag in bags]
-    left_open = [(bag, remark) for bag, remark in remarked if bag.state is BagState.INCOMPLETE]
+    """Yields sentences on bags that a crash left open, and on what else is wrong with bags."""
+    left_open = [bag for bag in bags if bag.state is BagState.INCOMPLETE]
     if left_open:
-        names = [
-            f"{short_name(bag.path)} ({shortened(remark)})" if remark else short_name(bag.path)
-            for bag, remark in left_open[-MAX_NAMED:]
-        ]
-        yield (
-            f"{counted(len(left_open), 'unfinished bag')}; "
-            f"{'its' if len(left_open) == 1 else 'their'} readable part is used: "
-            f"{listed(names, len(left_open))}"
-        )
-    yield from by_remark(
-        [(bag, remark) for bag, remark in remarked if bag.state is not BagState.INCOMPLETE],
-        MAX_NAMED,
-    )
+        after, files = unix_text(left_open[-1].end), counted(len(left_open), "bag")
+        yield f"messages after {after} may be missing, as a crash left {files} open"
+    damaged = [bag for bag in bags if bag.summary.schema.faults]
+    if damaged:
+        files = _newest([(bag.path, "; ".join(bag.summary.schema.faults)) for bag in damaged])
+        yield f"messages may be missing: {files}"
 
 
 def describe_misdated(faults: Sequence[ClockFault], what: str = "") -> str:
-    """Returns the sentence on bags that a wrong clock dated; the last ones are named."""
-    names = [f"{short_name(fault.bag.path)} ({fault.description})" for fault in faults[-MAX_NAMED:]]
-    bags = f"{counted(len(faults), 'bag')} dated by a wrong clock{what}"
-    return f"{bags}: {listed(names, len(faults))}"
+    """Returns the sentence on bags that a wrong clock dated."""
+    files = [(fault.bag.path, fault.description) for fault in faults]
+    return f"dated by a wrong clock{what}: {_newest(files)}"
+
+
+def _newest(files: Sequence[tuple[Path, str]]) -> str:
+    """Returns the last of some files, with what is wrong with it, and the number of the others.
+
+    `data_time_range` lists them all.
+    """
+    path, reason = files[-1]
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"{short_name(path)} ({shortened(reason)}){more}"
 
 
 def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | None:
@@ -643,7 +641,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
         of_s = f"{unix_from_ns(length):.{digits}f}"
         what = "here are only" if deleted else "recorded only"
         if recorded_s != of_s:
-            view.notes.add(f"{what} {recorded_s} of {of_s} s {when}")
+            view.notes.add(f"{what} {recorded_s} of {of_s} s")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:

@@ -20,7 +20,7 @@ from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, Q
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View
@@ -226,8 +226,8 @@ class ParallelRecordings(NamedTuple):
                 f"{self.first.name} has the time {span} twice, as the clock was set back meanwhile"
             )
         return (
-            f"{self.first.name} and {self.other.name} have different messages on {topic} {span}, "
-            "as after a clock was set back, or from two robots"
+            f"{self.first.name} and {self.other.name} differ on {topic} {span}, as after a clock "
+            "was set back, or of two robots"
         )
 
 
@@ -248,9 +248,8 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
-            f"{counted(len(names), 'recording has', 'recordings have')} different messages on "
-            f"{topic} at the same time, as from several robots: {listed(names)}; one path over "
-            "them would be wrong: ask about a time with one of them, or set data.recording to one",
+            f"recordings differ on {topic} at the same time, as of several robots: "
+            f"{listed(names)}; ask about a time with one of them, or set data.recording to one",
         )
     for pair in parallel:
         before = "files from before" if pair.is_twice else pair.first.name
@@ -267,17 +266,13 @@ def note_robots(view: View, topic: str, window: TimeWindow, *, places: bool = Fa
     names = _recording_names(view, [pair for pair in parallel if not pair.by_clock])
     if names:
         view.notes.add(
-            f"{len(names)} recordings have different messages on {topic} at the same time, as "
-            f"from several robots, and the answer does not separate them: {listed(names)}"
+            f"recordings differ on {topic} at the same time, as of several robots, and are mixed "
+            f"here: {listed(names)}"
         )
     for pair in parallel:
         if pair.by_clock:
             is_left_out = places and pair.is_twice
-            what = (
-                "what was seen then has no place"
-                if is_left_out
-                else "the answer does not separate the two"
-            )
+            what = "what was seen then has no place" if is_left_out else "the two are mixed here"
             view.notes.add(f"{pair.describe_by_clock(topic)}: {what}")
     spans = [pair.span for pair in parallel if pair.is_twice or not pair.by_clock]
     return united((span.start, span.stop) for span in spans)
@@ -348,8 +343,8 @@ def _parallel_recordings(
             return differing
     except QueryTimeoutError:
         view.notes.add(
-            "out of time before it was known whether recordings of one time have different "
-            f"messages on {topic}, as of several robots"
+            f"out of time before it was known whether recordings differ on {topic} at the same "
+            "time, as of several robots"
         )
     return None
 

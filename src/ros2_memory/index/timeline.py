@@ -15,6 +15,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
 from ros2_memory.core.arrays import Ints, concatenated, joined_codes, run_starts
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import (
@@ -307,14 +308,13 @@ class Timeline:
     def faulty(self, window: TimeWindow) -> list[BagFile]:
         """Returns the bags whose faults may concern the window, in order.
 
-        A bag that a crash left open may lack messages up to its mtime, if that is within a day.
+        A bag that a crash left open may lack messages up to its mtime, if that is within a day: if
+        nothing else is wrong with it, from its last ones on.
         """
         faulty = []
         for segment in self.segments:
             if segment.first[0] < window.stop:
-                faulty += [
-                    bag for bag in segment.faulty if window.overlaps(bag.start, _end_of_faults(bag))
-                ]
+                faulty += [bag for bag in segment.faulty if window.overlaps(*_span_of_faults(bag))]
         return faulty
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
@@ -341,9 +341,12 @@ class Timeline:
         return segment.bags[int(rows[-1 if last else 0])]
 
 
-def _end_of_faults(bag: BagFile) -> Ns:
-    is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
-    return bag.mtime_ns if bag.state is BagState.INCOMPLETE and is_late else bag.end
+def _span_of_faults(bag: BagFile) -> Span:
+    if bag.state is not BagState.INCOMPLETE:
+        return bag.start, bag.end
+    is_cut_off = bag.summary.remarks and not bag.summary.schema.faults
+    start = max(bag.end - OUT_OF_ORDER_NS, bag.start) if is_cut_off else bag.start
+    return start, bag.mtime_ns if bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS else bag.end
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:

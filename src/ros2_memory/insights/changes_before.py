@@ -421,8 +421,6 @@ def recap_before(
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
     elif not changes.looked_at:
         view.notes.add("no topic that would show a change is recorded at this time")
-    elif not past:
-        view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
     for topic, events in changes.events.items():
         note_left_out(view, topic, events)
     what = "the pose, the state and the changes may be from before that or from after it"

@@ -13,8 +13,14 @@ from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span, local_text
-from ros2_memory.history.coverage import cut_spans, excluded_spans, recording_gaps, unix_text
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
+from ros2_memory.history.coverage import (
+    cut_spans,
+    excluded_spans,
+    recording_gaps,
+    span_text,
+    unix_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -123,8 +129,7 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
         return ()
     longest = sorted(silences, key=lambda silence: silence.start - silence.end)[:MAX_NAMED]
     names = [
-        f"{silence.topic} {unix_text(silence.start)} to {unix_text(silence.end)} "
-        f"({local_text(silence.start)} to {local_text(silence.end)})"
+        f"{silence.topic} {span_text(silence.start, silence.end)}"
         for silence in sorted(longest, key=lambda silence: silence.start)
     ]
     return (f"silent while the robot was on, so not searched: {listed(names, len(silences))}",)

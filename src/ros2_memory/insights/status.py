@@ -10,6 +10,7 @@ from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
+from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.errors import BagError, NotInLakeError, RefusedError, UndecodableError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -266,7 +267,11 @@ def missing_data(view: View) -> Iterator[str]:
     if contradictory:
         bags = counted(len(contradictory), "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
-    broken = view.memory.scanner.damaged_parts(snapshot.bags)
+    broken = [
+        bag
+        for bag, reason in view.memory.scanner.damaged_parts(snapshot.bags)
+        if not reason.endswith(READ_WITHOUT_INDEXES)
+    ]
     if broken:
         bags = counted(len(broken), "bag", "bags")
         yield f"{bags} could not be read whole; data_time_range names what is damaged"

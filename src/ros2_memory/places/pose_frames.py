@@ -10,6 +10,7 @@ start of the robot.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,7 +33,7 @@ from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import Place, names_by_size
 from ros2_memory.core.spans import Spans, spans_of, without
-from ros2_memory.core.text import Reason, abbreviate, counted
+from ros2_memory.core.text import Reason, abbreviate, counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
@@ -406,11 +407,11 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
         root = root_above(view, frame_id)
         advice = f"ask with frame_id={root}"
         if root != view.limits.map_frame:
-            advice = f"if that is a map, set data.map_frame={root}"
-        leads = f"; transforms lead from it to {root}: {advice}" if root else ""
+            advice = f"if {root}, which it leads to, is a map, set data.map_frame={root}"
+        leads = f"; {advice}" if root else ""
         view.notes.add(
-            f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
-            f"coordinates may be another place in each{leads}"
+            f"{changing_origin(frame_id)}, and these are several: the same coordinates may be "
+            f"another place in each{leads}"
         )
 
 
@@ -475,22 +476,25 @@ def places_in(
 ) -> list[tuple[Place, KnownTrack]]:
     """Returns the places in the frames of a placement, each with the track in its frame.
 
-    A note names each place in another frame.
+    Notes name the places in other frames.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    tracks: list[tuple[Place, KnownTrack]] = []
+    elsewhere = defaultdict[str, list[str]](list)
     for place in places:
-        if place.frame_id in placement.frames:
-            tracks.append((place, known_track(view, place.frame_id, window)))
-        else:
-            view.notes.add(
-                f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
-                f"known in {' and '.join(placement.frames)}"
-                f"{_body_there(view, place.frame_id, placement.pose_frame)}"
-            )
-    return tracks
+        if place.frame_id not in placement.frames:
+            elsewhere[place.frame_id].append(place.name)
+    for frame_id, names in elsewhere.items():
+        view.notes.add(
+            f"left out, as in {frame_id}: {listed(names)}; where the robot was is known in "
+            f"{' and '.join(placement.frames)}{_body_there(view, frame_id, placement.pose_frame)}"
+        )
+    return [
+        (place, known_track(view, place.frame_id, window))
+        for place in places
+        if place.frame_id in placement.frames
+    ]
 
 
 def note_overlaps(view: View, spans_of_places: Iterable[Spans]) -> None:

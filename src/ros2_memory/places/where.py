@@ -43,6 +43,7 @@ from ros2_memory.places.pose_frames import (
     map_placement,
     placed_times,
 )
+from ros2_memory.places.robot_tracks import TrackReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -259,7 +260,7 @@ def note_other_frame(
     if where.frame_id is not None or pose_frame == placement.frame_id:
         return
     with suppress(QueryTimeoutError):
-        if known_track(view, pose_frame, window).inside(where.region, window):
+        if TrackReader(view, pose_frame).track_in(window).inside(where.region, window):
             view.notes.add(
                 f"x and y were taken in {placement.frame_id}; the robot was at those in "
                 f"{pose_frame}, the frame of get_position_*: {advice}"

@@ -23,6 +23,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.errors import BagContradictionError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
@@ -75,7 +76,7 @@ _ASCENDING: Final = """
     ORDER BY timestamp, rowid
 """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
-_WRONG_INDEX: Final = "its index by time is damaged; its messages were read without it"
+_WRONG_INDEX: Final = f"its index by time is damaged; {READ_WITHOUT_INDEXES}"
 _METADATA: Final = (
     ("offered_qos_profiles", "offered_qos_profiles"),
     ("type_description_hash", "topic_type_hash"),

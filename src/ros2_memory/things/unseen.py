@@ -218,8 +218,8 @@ def blind_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator
             spans.setdefault(blind.topic, []).append(span)
     for topic, of_topic in spans.items():
         yield (
-            f"{topic} detected nothing {listed(of_topic)}, also where it otherwise does, as in the "
-            "dark: these are no looks"
+            f"{topic} was blind {listed(of_topic)}, as in the dark: what was there then is not "
+            "known"
         )
 
 
@@ -357,14 +357,13 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
         yield from _silence_notes(view, known, question)
     if len(known.frames) > 2:  # the first is the map's
         yield (
-            "without a map, each run of odometry has its own coordinates: a thing may be listed "
-            "once for each run"
+            "without a map, a thing may be listed once for each run of odometry, in coordinates of "
+            "that run"
         )
     if not known.estimate.topics and known.since is None and not question.undecoded:
         yield (
-            "no things are known: no message has a detection, which is an object with one of the "
-            f"fields {', '.join(LABELS)}, as in vision_msgs/msg/Detection3DArray; find_matches "
-            "searches text"
+            f"no things are known: no message has an object with {' or '.join(LABELS)}; "
+            "find_matches searches text"
         )
     yield from crowded_notes(known)
     yield from blind_notes(known, (question.window,))

@@ -52,7 +52,7 @@ def mounted(parent: str, at: int = T0) -> Msg:
     return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
 
 
-MIXED = re.compile("as from several robots.*blue, red")
+MIXED = re.compile("as of several robots.*blue, red")
 
 
 def test_what_is_read_to_tell_robots_apart_says_nothing_of_the_answer(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_robots_that_there_is_no_time_to_tell_apart_are_no_single_one(
 ) -> None:
     monkeypatch.setattr(robots, "_lacks_most", Mock(side_effect=QueryTimeoutError("late")))
     reply = asked(both, "get_topic_in_range", topic="/odom", start=T0_S + 7, end=T0_S + 9)
-    assert "known whether recordings of one time have different messages" in str(reply["notes"])
+    assert "known whether recordings differ on" in str(reply["notes"])
 
 
 def driven(memory: Memory, start: int, stop: int) -> Any:
@@ -196,7 +196,7 @@ def test_a_way_over_both_robots_is_not_known(both: Memory, asks: dict[str, objec
     def ask(tool: str, **more: object) -> Any:
         return asked(both, tool, **WINDOW, **asks, **more)
 
-    told, unknown = ask("recap"), "the path is unknown: 2 recordings"
+    told, unknown = ask("recap"), "the path is unknown: recordings differ"
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
     assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]
     assert any(unknown in note for note in told["notes"])
@@ -223,7 +223,7 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     # Of 60 m and 59.5 m, without the 20 m of the 40 s that are twice: a gap is no way.
     assert told["distance_m"] == pytest.approx(100.0, abs=0.6)
     [note] = [each for each in told["notes"] if "run_0 and run_1" in each]
-    assert "as after a clock was set back, or from two robots" in note
+    assert "as after a clock was set back, or of two robots" in note
     assert note.endswith("the path there is that of run_0")
     recapped = asked(memory, "recap", **window)
     assert recapped["distance_m"] == pytest.approx(told["distance_m"], abs=0.02)
@@ -246,7 +246,7 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     assert warned(memory) == []
     told = driven(memory, 95, 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
-    assert "run_1 and run_2 have different messages" in str(told["notes"])
+    assert "run_1 and run_2 differ on" in str(told["notes"])
     # What lies in a time that the recording had before is left out, and nothing is a jump back.
     for known in (memory, with_store(memory, tmp_path)):
         whole = driven(known, 0, 200)

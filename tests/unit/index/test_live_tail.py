@@ -140,7 +140,7 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(
         tail.memory = with_store(tail.memory, tail.bag_dir)
     reply = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 10)
     assert reply["total"] == ends[3][1] - (ends[1][1] - ends[0][1])
-    assert "rec/rec_0.mcap: left out: 1 damaged record" in str(reply["notes"])
+    assert "rec/rec_0.mcap (left out: 1 damaged record" in str(reply["notes"])
     assert "crash" not in str(reply["notes"])
 
 

@@ -106,8 +106,7 @@ def test_what_the_clock_skipped_is_neither_recorded_nor_missing_nor_unknown(tmp_
     for memory in each_known(plain):
         reply = asked(memory, "recap", start=BEGIN - 100, end=BEGIN + 659.9)
         assert note in reply["notes"]
-        window = f"between {BEGIN - 100}.000000 and {BEGIN + 659}.900000"
-        assert f"recorded only 160 of 260 s {window}" in reply["notes"]
+        assert "recorded only 160 of 260 s" in reply["notes"]
         inside: dict[str, Any] = {"topic": "/odom", "start": BEGIN + 300, "end": BEGIN + 400}
         for missing in (
             asked(memory, "get_position_at", timestamp=BEGIN + 300),
@@ -344,7 +343,7 @@ def test_a_duration_across_a_clock_that_was_set_back_and_put_right_may_be_too_lo
     reply = asked(memory_of(tmp_path), "find_matches", **docked)
     assert [row["duration_s"] for row in reply["sightings"]] == [35.0]
     [note] = [note for note in reply["notes"] if "durations across" in note]
-    assert "may be too short by as much, or too long if it was put right again" in note
+    assert note.endswith(": durations across that may be wrong by as much")
 
 
 LENGTH = 30

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from mcap.opcode import Opcode
 
+from ros2_memory.core.bag_summary import ENDS_EARLY, NONE_LOST
 from ros2_memory.core.text import counted
 from ros2_memory.storage.contents import Tally
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
@@ -257,12 +258,12 @@ class _Scan:
     def _end_note(self) -> str:
         if self.partial_bytes:
             return (
-                f"the file ends early: of its last chunk, {self.partial_bytes} compressed bytes,"
+                f"{ENDS_EARLY}: of its last chunk, {self.partial_bytes} compressed bytes,"
                 " only a part could be read"
             )
         if self.data_ended:
-            return "the file ends early, behind its messages: none is lost"
+            return f"{ENDS_EARLY}, behind its messages: {NONE_LOST}"
         unread = self.file.size - self.read_to
         if unread:
-            return f"the file ends early: the last {unread} bytes could not be read"
-        return "the file ends early: its writer did not finish it"
+            return f"{ENDS_EARLY}: the last {unread} bytes could not be read"
+        return f"{ENDS_EARLY}: its writer did not finish it"
