@@ -582,6 +582,23 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
     assert "robot" not in around["state"]
 
 
+def test_a_position_says_where_it_is_not_known_which_place_that_is(tmp_path: Path) -> None:
+    """The newest pose is newer than the newest transform to the map, as it mostly is."""
+    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
+    messages += [
+        tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(59)
+    ]
+    den = Place("den", "map", Circle(55.0, 0.0, 5.0))
+    memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
+    known = asked(memory, "get_position_at", timestamp=T0_S + 50)
+    assert (known["in"], known.get("notes")) == ("den", None)
+    newest = asked(memory, "get_position_at", timestamp=T0_S + 59)
+    assert "in" not in newest
+    assert newest["notes"] == ["in which place is not known: no transform leads to map then"]
+    bare = remembered(tmp_path / "bare", [odom(T0, 0.0)], limits=QuerySettings(places=(den,)))
+    assert "notes" not in asked(bare, "get_position_at", timestamp=T0_S)
+
+
 def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
     tmp_path: Path,
 ) -> None:

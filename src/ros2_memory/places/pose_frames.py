@@ -291,7 +291,10 @@ def _require_transform(
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
-    """Returns a pose with the names of the places that it is in, whatever their frames."""
+    """Returns a pose with the names of the places that it is in, whatever their frames.
+
+    A note names a frame of places that transforms lead to at another time alone.
+    """
     places = view.limits.places
     frames = {place.frame_id for place in places}
     pose_of_frame = {frame: pose_in(view, pose, frame, time, recording) for frame in frames}
@@ -300,6 +303,9 @@ def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
         in_frame = pose_of_frame[place.frame_id]
         if in_frame is not None and place.region.contains(*in_frame.position[:2]):
             inside.append(place)
+    for frame, in_frame in pose_of_frame.items():
+        if in_frame is None and pose.frame_id and connects(view, (frame, pose.frame_id)):
+            view.notes.add(f"in which place is not known: no transform leads to {frame} then")
     return replace(pose, places=names_by_size(inside))
 
 
