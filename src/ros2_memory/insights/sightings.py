@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Equals, NearPosition, matched_texts
+from ros2_memory.analysis.facts import LOG
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
-from ros2_memory.core.text import Quoted, named, quote
+from ros2_memory.core.text import Quoted, leaves, named, quote
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of
@@ -530,6 +531,9 @@ def _sighting(
     if robot is None and robot_at_first:
         # A recording may begin with the match, and have its first pose only after it.
         robot, robot_at_first = robot_at(view, run.last, newest_recording, frame_id), False
+    texts = matched_texts(condition.of_type(newest.type, view.extractor), value)
+    if not texts and newest.type == LOG:
+        texts = tuple(str(text) for path, text in leaves(value) if path in {"name", "msg"})
     until, ended = run.last, True
     if thing is None:
         until = _lasted_until(view, run, scope, is_flag=_is_flag(condition))
@@ -545,10 +549,7 @@ def _sighting(
         thing=_place_of_thing(
             view, condition, newest, run.first, robot, thing=thing, frame_id=frame_id
         ),
-        matched=tuple(
-            named(text) if text in labels else Quoted(text)
-            for text in matched_texts(condition.of_type(newest.type, view.extractor), value)
-        ),
+        matched=tuple(named(text) if text in labels else Quoted(text) for text in texts),
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
         ended=ended,

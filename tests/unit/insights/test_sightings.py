@@ -336,6 +336,10 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) 
         return [each["value"]["msg"] for each in found["sightings"]]
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
+    errors = {"topic": "/rosout", "condition_type": "above", "field": "level", "value": "WARN"}
+    found = asked(memory, "find_matches", **errors)
+    assert found["quoted"] == ["sightings.matched"]
+    assert [each["matched"] for each in found["sightings"]] == [["nav", "lost"]]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
     slow = find_matches(
         memory, Call(), Sought("/rosout", "contains", "lo"), oldest_first=True, limit=2
