@@ -677,9 +677,9 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
     Raises:
         ConfigError: their file is missing or refused.
     """
-    from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
+    from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle, Storey
 
-    def region(shape: PlaceShape) -> Region:
+    def plan(shape: PlaceShape) -> Region:
         if shape.polygon is not None:
             return Polygon(shape.polygon)
         if isinstance(shape.x, tuple) and isinstance(shape.y, tuple):
@@ -687,6 +687,9 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
         # The model allows no other shape.
         circle = cast("tuple[float, float, float]", (shape.x, shape.y, shape.radius_m))
         return Circle(*circle)
+
+    def region(shape: PlaceShape) -> Region:
+        return plan(shape) if shape.z is None else Storey(plan(shape), *shape.heights)
 
     default = settings.data.map_frame or ""
     return tuple(

@@ -14,6 +14,7 @@ alone.
 from __future__ import annotations
 
 import glob
+import math
 import os
 import re
 import sys
@@ -567,7 +568,8 @@ class LabelsFile:
 class PlaceShape:
     """A circle (x, y, radius_m), a rectangle (x and y as [from, to]) or a polygon, in metres.
 
-    `frame` is the frame of its coordinates; without it, `data.map_frame`.
+    `z` has its heights, [from, to], either of which may be null; without it, all count. `frame` is
+    the frame of its coordinates; without it, `data.map_frame`.
     """
 
     frame: Text | None = None
@@ -575,9 +577,19 @@ class PlaceShape:
     y: Extent | None = None
     radius_m: Positive | None = None
     polygon: tuple[tuple[Metres, Metres], ...] | None = None
+    z: tuple[Metres | None, Metres | None] | None = None
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """The least and the greatest z, which may be infinite."""
+        low, high = self.z or (None, None)
+        return -math.inf if low is None else low, math.inf if high is None else high
 
     def __post_init__(self) -> None:
-        """Refuses what is not exactly one of the three shapes."""
+        """Refuses what is not exactly one of the three shapes, and heights out of order."""
+        low, high = self.heights
+        if low >= high:
+            raise ValueError("must have z: [from, to] with from below to; either may be null")
         x, y, radius_m = self.x, self.y, self.radius_m
         if self.polygon is not None:
             is_shape = (x, y, radius_m) == (None, None, None) and not _lie_in_a_line(self.polygon)

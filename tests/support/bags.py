@@ -352,6 +352,7 @@ def odom(
     y: float = 0.0,
     yaw: float = 0.0,
     *,
+    z: float = 0.0,
     vx: float = 0.0,
     wz: float = 0.0,
     topic: str = "/odom",
@@ -359,7 +360,7 @@ def odom(
 ) -> Msg:
     """An Odometry message (odom -> base_link) stamped and, by default, logged at `ns`."""
     covariance = np.zeros(36)
-    pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(yaw))
+    pose = make("geometry_msgs/msg/Pose", position=point(x, y, z), orientation=quaternion(yaw))
     body = make(
         "nav_msgs/msg/Odometry",
         header=header(ns, "odom"),

@@ -1,5 +1,6 @@
 """Named places, and the rules of `recording.keep_when` and `exclude_when`, as configured."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from ros2_memory.bootstrap import exclusions_of, places_of, query_settings_of, rules_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
+from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle, Storey
 from ros2_memory.triggers.exclusion import ExclusionRule
 from ros2_memory.triggers.rules import Rule
 from tests.support.memories import ROOT
@@ -132,12 +133,20 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
         "places:\n"
         "  dock: {x: 6, y: 0.6, radius_m: 0.4}\n"
         "  kitchen: {x: [0, 5], y: [5.5, 9]}\n"
-        "  corner: {frame: yard, polygon: [[0, 0], [2, 0], [0, 2]]}\n",
+        "  corner: {frame: yard, polygon: [[0, 0], [2, 0], [0, 2]]}\n"
+        "  loft: {x: 6, y: 0.6, radius_m: 0.4, z: [2.2, 5]}\n"
+        "  bedroom: {x: [0, 5], y: [5.5, 9], z: [2.2, null]}\n"
+        "  cellar: {polygon: [[0, 0], [2, 0], [0, 2]], z: [null, -1]}\n"
+        "  tower: {x: 6, y: 0.6, radius_m: 0.4, z: [null, null]}\n",
     )
     assert found == (
         Place("dock", "map", Circle(6.0, 0.6, 0.4)),
         Place("kitchen", "map", Rectangle(0.0, 5.0, 5.5, 9.0)),
-        Place("corner", "yard", Polygon(((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)))),
+        Place("corner", "yard", corner := Polygon(((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)))),
+        Place("loft", "map", Storey(Circle(6.0, 0.6, 0.4), 2.2, 5.0)),
+        Place("bedroom", "map", Storey(Rectangle(0.0, 5.0, 5.5, 9.0), 2.2, math.inf)),
+        Place("cellar", "map", Storey(corner, -math.inf, -1.0)),
+        Place("tower", "map", Storey(Circle(6.0, 0.6, 0.4), -math.inf, math.inf)),
     )
 
 
@@ -157,6 +166,10 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
         "{x: .nan, y: 0, radius_m: 1}",
         "{radius_m: 0, x: 1, y: 1}",
         "{colour: red}",
+        "{x: 6, y: 0.6, radius_m: 0.4, z: 2}",
+        "{x: 6, y: 0.6, radius_m: 0.4, z: [2, 2]}",
+        "{x: 6, y: 0.6, radius_m: 0.4, z: [.nan, 2]}",
+        "{z: [0, 2]}",
     ],
 )
 def test_what_is_no_shape_is_refused(tmp_path: Path, shape: str) -> None:

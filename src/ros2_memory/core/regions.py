@@ -1,4 +1,4 @@
-"""Regions of the plane: circles, boxes and polygons, and the parts of a path inside of them.
+"""Regions: circles, boxes and polygons, at any height or at some, and parts of a path inside them.
 
 Lengths are metres. The border of a region is inside.
 """
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.core.arrays import Flags
+    from ros2_memory.core.model import Vector3
 
 Floats: TypeAlias = "NDArray[np.float64]"
 Point: TypeAlias = "tuple[float, float]"
@@ -28,12 +29,14 @@ _NEVER: Final = (2.0, -1.0)
 
 
 class Steps(NamedTuple):
-    """Straight steps of a path, from (x, y) to (to_x, to_y)."""
+    """Straight steps of a path, from (x, y, z) to (to_x, to_y, to_z); z is NaN if unknown."""
 
     x: Floats
     y: Floats
+    z: Floats
     to_x: Floats
     to_y: Floats
+    to_z: Floats
 
     @property
     def moved(self) -> tuple[Floats, Floats]:
@@ -117,20 +120,24 @@ class Rectangle:
 
     def shares_inside(self, steps: Steps) -> tuple[Floats, Floats]:
         """Returns from which to which share each step is inside; the first is greater if never."""
-        start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
-        for at, to, low, high in (
-            (steps.x, steps.to_x, self.min_x, self.max_x),
-            (steps.y, steps.to_y, self.min_y, self.max_y),
-        ):
-            along = to - at
-            moves = along != 0
-            divisor = np.where(moves, along, 1.0)
-            at_low, at_high = (low - at) / divisor, (high - at) / divisor
-            is_between = (at >= low) & (at <= high)
-            start_if_still = np.where(is_between, 0.0, _NEVER[0])
-            start = np.maximum(start, np.where(moves, np.minimum(at_low, at_high), start_if_still))
-            stop = np.minimum(stop, np.where(moves, np.maximum(at_low, at_high), 1.0))
-        return start, stop
+        x_start, x_stop = _shares_between(steps.x, steps.to_x, self.min_x, self.max_x)
+        y_start, y_stop = _shares_between(steps.y, steps.to_y, self.min_y, self.max_y)
+        return np.maximum(x_start, y_start), np.minimum(x_stop, y_stop)
+
+
+def _shares_between(at: Floats, to: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+    """Returns from which to which share steps lie between two values; `_NEVER` if they never do.
+
+    A value that is NaN lies nowhere.
+    """
+    along = to - at
+    moves = along != 0
+    divisor = np.where(moves, along, 1.0)
+    at_low, at_high = (low - at) / divisor, (high - at) / divisor
+    is_between = (at >= low) & (at <= high)
+    start_if_still = np.where(is_between, 0.0, _NEVER[0])
+    start = np.where(moves, np.minimum(at_low, at_high), start_if_still)
+    return start, np.where(moves, np.maximum(at_low, at_high), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,10 +197,6 @@ class AnyOf:
 
     regions: tuple[Region, ...]
 
-    def contains(self, x: float, y: float) -> bool:
-        """Returns whether a point is inside one of them."""
-        return any(region.contains(x, y) for region in self.regions)
-
     @property
     def bounds(self) -> Bounds:
         """The least and greatest x, and the least and greatest y."""
@@ -215,7 +218,39 @@ class AnyOf:
         return ClippedSteps(step[begins], start[begins], np.maximum.reduceat(stop, begins))
 
 
-Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf"
+@dataclass(frozen=True, slots=True)
+class Storey:
+    """The points of a region whose z is within two values, which may be infinite."""
+
+    plan: Region
+    low: float
+    high: float
+
+    @property
+    def bounds(self) -> Bounds:
+        """The least and greatest x, and the least and greatest y."""
+        return self.plan.bounds
+
+    def clipped(self, steps: Steps) -> ClippedSteps:
+        """Returns the parts of steps inside."""
+        step, start, stop = clipped(self.plan, steps)
+        low, high = _shares_between(steps.z[step], steps.to_z[step], self.low, self.high)
+        start, stop = np.maximum(start, low), np.minimum(stop, high)
+        meets = start <= stop
+        return ClippedSteps(step[meets], start[meets], stop[meets])
+
+
+Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf | Storey"
+
+
+def contains(region: Region, x: float, y: float, z: float) -> bool:
+    """Returns whether a point is in a region; with a z of NaN, in none that has heights."""
+    match region:
+        case AnyOf(regions):
+            return any(contains(part, x, y, z) for part in regions)
+        case Storey(plan, low, high):
+            return low <= z <= high and contains(plan, x, y, z)
+    return region.contains(x, y)
 
 
 def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> Flags:
@@ -238,7 +273,7 @@ def clipped(region: Region, steps: Steps) -> ClippedSteps:
         & (np.maximum(steps.y, steps.to_y) >= low_y)
     )
     nearby = Steps(*(column[near] for column in steps))
-    if isinstance(region, Polygon | AnyOf):
+    if isinstance(region, Polygon | AnyOf | Storey):
         parts = region.clipped(nearby)
         return ClippedSteps(near[parts.step], parts.start, parts.stop)
     start, stop = region.shares_inside(nearby)
@@ -256,11 +291,10 @@ class Place:
     region: Region
 
 
-def places_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> tuple[str, ...]:
+def places_at(places: Sequence[Place], frame_id: str, point: Vector3) -> tuple[str, ...]:
     """Returns the names of the places of a frame that a point is in, the smallest first."""
-    return names_by_size(
-        place for place in places if place.frame_id == frame_id and place.region.contains(x, y)
-    )
+    of_frame = (place for place in places if place.frame_id == frame_id)
+    return names_by_size(place for place in of_frame if contains(place.region, *point))
 
 
 def names_by_size(places: Iterable[Place]) -> tuple[str, ...]:
@@ -268,8 +302,13 @@ def names_by_size(places: Iterable[Place]) -> tuple[str, ...]:
     return tuple(place.name for place in sorted(places, key=lambda place: _area(place.region)))
 
 
+def plan_of(region: Region) -> Region:
+    """Returns a region at all heights."""
+    return region.plan if isinstance(region, Storey) else region
+
+
 def _area(region: Region) -> float:
-    match region:
+    match plan_of(region):
         case Circle(radius_m=radius_m):
             return math.pi * radius_m**2
         case Polygon(corners):

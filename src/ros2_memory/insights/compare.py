@@ -382,7 +382,7 @@ class _ThingsBetween:
         """Returns whether a thing has a stay in the region."""
         if stay is None or self.where is None:
             return stay is not None
-        return self.where.contains(self.known.frames[instance.epoch], *stay.part.place[:2])
+        return self.where.contains(self.known.frames[instance.epoch], stay.part.place)
 
     def _difference(
         self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
@@ -552,7 +552,7 @@ def _compare_standstills(
         spans = (stop.span for stop in side.drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
     stood = (
-        at._replace(inside=places_at(places, frame, *at.place))
+        at._replace(inside=places_at(places, frame, at.place))
         for at in _standstill_differences(stood_at(*stands))
     )
     return frame, tuple(stood)

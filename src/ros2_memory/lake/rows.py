@@ -82,7 +82,7 @@ _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"
 _LARGEST: Final = 1 << 63
 """The first integer that is too large for Iceberg."""
 _NO_SCORE: Final = -1
-_NOWHERE: Final = (math.nan, math.nan)
+_NOWHERE: Final = (math.nan,) * 3
 _MM: Final = 1000.0
 _ANGLE_DIGITS: Final = 9
 _SCORE_UNIT: Final = 1000.0
@@ -303,8 +303,8 @@ class RowMaker:
         # A track counts whole turns; here headings are from -pi to pi.
         wrapped = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
         heading = wrapped.round(_ANGLE_DIGITS)
-        begins, x, y = track.begins, track.x, track.y
-        return _rows(same, time_ns=track.times, x=x, y=y, begins=begins, heading=heading)
+        begins, x, y, z = track.begins, track.x, track.y, track.z
+        return _rows(same, time_ns=track.times, x=x, y=y, z=z, begins=begins, heading=heading)
 
     def _things(self, frame: str, sights: Sights) -> Iterator[Row]:
         spots = sights.spots
@@ -406,7 +406,9 @@ class RowMaker:
         """Yields a row for each detection; `message` is the number of each message in its topic."""
         found, at = detected.found, detected.found.rows
         places = [place_at(track, time) for time in detected.log_times.tolist()]
-        robot_x, robot_y = np.array([place or _NOWHERE for place in places]).reshape(-1, 2).T
+        robot_x, robot_y, robot_z = (
+            np.array([place or _NOWHERE for place in places]).reshape(-1, 3).T
+        )
         labels, (x, y, z) = found.labels.values(), found.places.T
         return _rows(
             same,
@@ -422,6 +424,7 @@ class RowMaker:
             robot_frame=[frame if places[row] else None for row in at.tolist()],
             robot_x=robot_x[at],
             robot_y=robot_y[at],
+            robot_z=robot_z[at],
         )
 
     def _messages(self, bag: BagFile) -> Iterator[Row]:

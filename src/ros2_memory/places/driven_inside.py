@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.frames import Floats
+    from ros2_memory.core.model import Vector3
     from ros2_memory.history.context import Call, Memory
 
 _FARTHEST_FROM: Final = "farthest_from"
@@ -258,8 +259,8 @@ def farthest_from(
     pose = _farthest_pose(TrackReader(view, frame), track, spans, (x, y))
     if pose is None:
         return None
-    inside = places_at(view.limits.places, frame, pose.x, pose.y)
-    return FarthestPose((x, y), frame, pose.away_m, pose.time, (pose.x, pose.y), inside)
+    inside = places_at(view.limits.places, frame, pose.place)
+    return FarthestPose((x, y), frame, pose.away_m, pose.time, pose.place, inside)
 
 
 class _DistantPose(NamedTuple):
@@ -267,8 +268,7 @@ class _DistantPose(NamedTuple):
 
     away_m: float
     time: Ns
-    x: float
-    y: float
+    place: Vector3
 
 
 def _farthest_pose(
@@ -292,13 +292,13 @@ def _farthest_pose(
         first, last = next((first, last) for first, last in spans if first <= at <= last)
         around = TimeWindow(max(first, at - _AROUND_NS), min(last, at + _AROUND_NS) + 1)
         poses = tracks.poses(around)
-        rows = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
-        for time, pose_x, pose_y in rows:
-            away_m = math.hypot(pose_x - x, pose_y - y)
+        columns = (poses.times, poses.x, poses.y, poses.z)
+        for time, *place in zip(*(column.tolist() for column in columns), strict=True):
+            away_m = math.dist(place[:2], point)
             # A pose farther off the track is one that the robot jumped to and back from.
             is_on_track = away_m <= track_away_m[nth] + _OFF_TRACK_M
             if is_on_track and (farthest is None or away_m > farthest.away_m):
-                farthest = _DistantPose(away_m, time, pose_x, pose_y)
+                farthest = _DistantPose(away_m, time, (*place,))
     return farthest
 
 

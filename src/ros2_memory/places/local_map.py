@@ -77,7 +77,8 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
         return local_frame(origin), empty_track()
     times = np.array([at for at, _ in fixes], np.int64)
     x, y = np.array([east_north(origin, fix) for _, fix in fixes]).T
-    return local_frame(origin), track_of(times, x, y, np.full(len(fixes), math.nan))
+    unknown = np.full(len(fixes), math.nan)
+    return local_frame(origin), track_of(times, x, y, unknown, unknown)
 
 
 def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:

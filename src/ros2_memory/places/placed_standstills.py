@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.sights import STOREY_MM
 from ros2_memory.core.arrays import Flags, Ints, bounds_of
+from ros2_memory.core.regions import contains
 from ros2_memory.core.timebase import Ns, Span, unix_from_ns
 from ros2_memory.results import Pair, StandstillPlace
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.model import Vector3
     from ros2_memory.core.regions import Region
 
 SAME_STAND_M: Final = 0.5
@@ -29,10 +32,9 @@ _SAMPLES_OF_STAND: Final = 9
 
 
 class PlacedStandstill(NamedTuple):
-    """A standstill and its place (m); `start` is a log time, `duration` in ns."""
+    """A standstill, its place (m; z is its middle's), its begin (log time) and length (ns)."""
 
-    x: float
-    y: float
+    place: Vector3
     start: Ns
     duration: Ns
 
@@ -51,11 +53,13 @@ def placed_standstills(
     is_known = _is_known(track, times)
     has_known = is_known.any(axis=1)
     ends, times, is_known = ends[has_known], times[has_known], is_known[has_known]
-    x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(times)[:2])
-    rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
-    for stand_x, stand_y, start, stop in rows:
-        if region is None or region.contains(stand_x, stand_y):
-            yield PlacedStandstill(stand_x, stand_y, start, stop - start)
+    *plane, height, _ = track.at(times)
+    x_of, y_of = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in plane)
+    z_of = height[:, _SAMPLES_OF_STAND // 2]
+    rows = zip(*(column.tolist() for column in (x_of, y_of, z_of, *ends.T)), strict=True)
+    for x, y, z, start, stop in rows:
+        if region is None or contains(region, x, y, z):
+            yield PlacedStandstill((x, y, z), start, stop - start)
 
 
 def _is_known(track: RobotTrack, times: Ints) -> Flags:
@@ -70,23 +74,24 @@ def stood_at(
 ) -> list[StandstillPlace]:
     """Returns the places where the robot stood in two windows, and how long in each.
 
-    A place is where the robot stood longest, and gathers standstills within `SAME_STAND_M`. The
-    names of places are left empty.
+    A place is where the robot stood longest, and gathers standstills within `SAME_STAND_M` on its
+    storey. The names of places are left empty.
     """
     stands = [*((stand, 0) for stand in this), *((stand, 1) for stand in other)]
     stands.sort(key=lambda numbered: (-numbered[0].duration, numbered[0]))
-    middles, lasted = np.empty((len(stands), 2)), np.zeros((len(stands), 2), np.int64)
+    middles, lasted = np.empty((len(stands), 3)), np.zeros((len(stands), 2), np.int64)
     count = 0
     for stand, window in stands:
-        squared = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
+        x, y, z = (middles[:count] - stand.place).T
+        squared = np.where(np.abs(z) > STOREY_MM / 1000, np.inf, x * x + y * y)
         place = count
         if (squared <= SAME_STAND_M**2).any():
             place = int(squared.argmin())
         else:
-            middles[count] = stand.x, stand.y
+            middles[count] = stand.place
             count += 1
         lasted[place, window] += stand.duration
     return [
-        StandstillPlace((x, y), (), Pair(*map(unix_from_ns, lengths)))
-        for (x, y), lengths in zip(middles[:count].tolist(), lasted.tolist(), strict=False)
+        StandstillPlace((x, y, z), (), Pair(*map(unix_from_ns, lengths)))
+        for (x, y, z), lengths in zip(middles[:count].tolist(), lasted.tolist(), strict=False)
     ]

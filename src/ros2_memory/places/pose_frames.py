@@ -31,7 +31,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import Place, names_by_size
+from ros2_memory.core.regions import Place, contains, names_by_size
 from ros2_memory.core.spans import Spans, spans_of, without
 from ros2_memory.core.text import Reason, abbreviate, counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
@@ -301,7 +301,7 @@ def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
     inside: list[Place] = []
     for place in places:
         in_frame = pose_of_frame[place.frame_id]
-        if in_frame is not None and place.region.contains(*in_frame.position[:2]):
+        if in_frame is not None and contains(place.region, *in_frame.position):
             inside.append(place)
     for frame, in_frame in pose_of_frame.items():
         if in_frame is None and pose.frame_id and connects(view, (frame, pose.frame_id)):
@@ -544,7 +544,8 @@ class RobotPlaces:
         """
         if self.frame_id != self.placement.frame_id:
             return None
-        return place_at(self._track_in(self.frame_id), time, SILENCE_NS)
+        point = place_at(self._track_in(self.frame_id), time, SILENCE_NS)
+        return None if point is None else point[:2]
 
     def standstill_time(self, start: Ns, end: Ns) -> Ns:
         """Returns the time that shows where the robot stood.
@@ -564,7 +565,7 @@ class RobotPlaces:
         for place in self.view.limits.places:
             if place.frame_id in self.placement.frames:
                 point = place_at(self._track_in(place.frame_id), time, SILENCE_NS)
-                if point is not None and place.region.contains(*point):
+                if point is not None and contains(place.region, *point):
                     inside.append(place)
         return names_by_size(inside)
 

@@ -290,7 +290,8 @@ class TrackReader:
         def make() -> PartialTrack:
             placed = self._poses_of(rows, lent_spans)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
-            return partial_track(*placed)._replace(recording=recording)
+            track = partial_track(*placed[:5])
+            return track._replace(left_out=placed.left_out, recording=recording)
 
         return remembered(self._view, TRACKS, key, make)
 
@@ -384,8 +385,8 @@ class TrackReader:
             else:
                 edges = edges_of_rows(self._view, rows, session)
                 body_poses = placed_body(edges, self._body, frames, span)
-                x, y, _ = body_poses.positions.T
-                placed.append(Placed(body_poses.times, x, y, headings(body_poses.turns), 0))
+                x, y, z = body_poses.positions.T
+                placed.append(Placed(body_poses.times, x, y, z, headings(body_poses.turns), 0))
         return _in_time_order(placed)
 
 
@@ -407,6 +408,7 @@ class Placed(NamedTuple):
         times: log times (ns), ascending.
         x: metres.
         y: metres.
+        z: metres.
         heading: radians; NaN for a pose without a heading.
         left_out: how many other poses no transform places.
     """
@@ -414,20 +416,20 @@ class Placed(NamedTuple):
     times: Ints
     x: Floats
     y: Floats
+    z: Floats
     heading: Floats
     left_out: int
 
 
-NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0), 0)
+NOWHERE: Final = Placed(np.zeros(0, np.int64), *(np.zeros(0),) * 4, 0)
 
 
 def _in_time_order(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of one or more tables, in order of log time."""
-    columns = zip(*(part[:4] for part in parts), strict=True)
-    times, x, y, heading = map(np.concatenate, columns)
-    order = stable_order(times)
-    left_out = sum(part.left_out for part in parts)
-    return Placed(times[order], x[order], y[order], heading[order], left_out)
+    columns = [*map(np.concatenate, zip(*(part[:5] for part in parts), strict=True))]
+    order = stable_order(columns[0])
+    times, x, y, z, heading = (column[order] for column in columns)
+    return Placed(times, x, y, z, heading, sum(part.left_out for part in parts))
 
 
 def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
@@ -443,13 +445,14 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
             in_target = frames.poses(name, poses.times[here])
             if in_target is None:
                 continue
-            x[here], y[here], _ = in_target.points((x[here], y[here], z[here]))
+            x[here], y[here], z[here] = in_target.points((x[here], y[here], z[here]))
             qx, qy, qz, qw = turns[here].T
             turns[here] = np.stack(multiply(in_target.rotation, (qx, qy, qz, qw)), axis=1)
             valid[here] = in_target.valid
     kept = np.flatnonzero(valid)
     left_out = len(poses) - len(kept)
-    return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
+    heading = headings(turns[kept])
+    return Placed(poses.times[kept], x[kept], y[kept], z[kept], heading, left_out)
 
 
 class _JoinedRecordings(NamedTuple):

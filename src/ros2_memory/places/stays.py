@@ -112,7 +112,8 @@ def stays(track: RobotTrack, region: Region) -> list[Stay]:
         return []
     # A step from each vertex to the next; from the last vertex of a piece to itself.
     after = np.arange(count) + ~track.ends
-    steps = Steps(track.x, track.y, track.x[after], track.y[after])
+    points = track.x, track.y, track.z
+    steps = Steps(*points, *(axis[after] for axis in points))
     parts = _without_jumps(clipped(region, steps), jumps(track))
     if not len(parts.step):
         return []

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from itertools import chain, pairwise
+from itertools import chain, pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -19,13 +19,14 @@ import numpy as np
 from ros2_memory.analysis.intervals import FLICKER_NS
 from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
+    TOLERANCE_OF_HEIGHT_M,
     TRACK_SLICE_NS,
     RobotTrack,
     place_at,
 )
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Circle, Region, Steps
+from ros2_memory.core.regions import Circle, Region, Steps, contains, plan_of
 from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, Span, ns_from_unix
@@ -367,8 +368,8 @@ class ConfirmedStays:
         stay = self._between_poses(visit)
         is_there = newest is not None and stay.start <= newest <= stay.stop and not stay.left
         closest_m, closest_at = None, None
-        if isinstance(self._region, Circle):
-            closest_m, closest_at = self._closest(visit.track, stay, self._region)
+        if isinstance(plan := plan_of(self._region), Circle):
+            closest_m, closest_at = self._closest(visit.track, stay, plan)
         return Visit(
             arrived=stay.start,
             departed=None if is_there else stay.stop,
@@ -472,9 +473,10 @@ class ConfirmedStays:
         middle = place_at(visit.track, (visit.whole.start + visit.whole.stop) // 2)
         if middle is None:
             return False
-        x, y = middle
-        off = (-TOLERANCE_M, TOLERANCE_M)
-        return all(self._region.contains(x + dx, y + dy) for dx in off for dy in off)
+        x, y, z = middle
+        off, off_z = (-TOLERANCE_M, TOLERANCE_M), (-TOLERANCE_OF_HEIGHT_M, TOLERANCE_OF_HEIGHT_M)
+        corners = product(off, off, off_z)
+        return all(contains(self._region, x + dx, y + dy, z + dz) for dx, dy, dz in corners)
 
     def _by_poses(self, visit: TrackedStay) -> Stay | None:
         """Returns a whole visit from its first to its last pose inside.
@@ -504,9 +506,9 @@ class ConfirmedStays:
     ) -> list[Ns]:
         """Returns the log times, from `first` to `last`, of poses or vertices in the region."""
         rows = slice(*np.searchsorted(path.times, (first, last + 1)))
-        columns = (path.times[rows], path.x[rows], path.y[rows])
+        columns = (path.times[rows], path.x[rows], path.y[rows], path.z[rows])
         points = zip(*(column.tolist() for column in columns), strict=True)
-        return [time for time, x, y in points if self._region.contains(x, y)]
+        return [time for time, *point in points if contains(self._region, *point)]
 
     def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
         """Returns the poses from the vertex before a log time to the vertex after it."""
@@ -522,8 +524,9 @@ class ConfirmedStays:
         """
         inner = track.times[(track.times > stay.start) & (track.times < stay.stop)]
         times = np.concatenate(([stay.start], inner, [stay.stop]))
-        x, y, _ = track.at(times)
-        along, away_m = Steps(x[:-1], y[:-1], x[1:], y[1:]).nearest_to(circle.x, circle.y)
+        points = track.at(times)[:3]
+        steps = Steps(*(axis[:-1] for axis in points), *(axis[1:] for axis in points))
+        along, away_m = steps.nearest_to(circle.x, circle.y)
         nearest = int(away_m.argmin())
         lasted = int(times[nearest + 1] - times[nearest])
         at = int(times[nearest]) + round(float(along[nearest]) * lasted)

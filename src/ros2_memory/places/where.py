@@ -24,7 +24,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
+from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, contains
 from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
@@ -48,7 +48,7 @@ from ros2_memory.places.robot_tracks import TrackReader
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
@@ -83,9 +83,9 @@ class Where:
     name: str | None = None
     several: tuple[Where, ...] = ()
 
-    def contains(self, frame_id: str, x: float, y: float) -> bool:
+    def contains(self, frame_id: str, point: Vector3) -> bool:
         """Returns whether a point (m) in a frame lies in the region."""
-        return self.frame_id in {None, frame_id} and self.region.contains(x, y)
+        return self.frame_id in {None, frame_id} and contains(self.region, *point)
 
     @property
     def each(self) -> tuple[Where, ...]:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         Quaternion,
         Transform,
         Twist,
+        Vector3,
     )
     from ros2_memory.core.regions import Circle
 
@@ -170,7 +171,7 @@ class FarthestPose:
         frame_id: of the point and the pose.
         distance_m: between them.
         time: log time of the pose.
-        place: x, y of the pose (m).
+        place: of the pose (m).
         inside: the named places around it, the smallest first.
     """
 
@@ -178,7 +179,7 @@ class FarthestPose:
     frame_id: str
     distance_m: float
     time: Ns
-    place: tuple[float, float]
+    place: Vector3
     inside: tuple[str, ...]
 
 

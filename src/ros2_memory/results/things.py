@@ -393,12 +393,12 @@ class StandstillPlace(NamedTuple):
     """A place where the robot stood in one window longer than in the other.
 
     Attributes:
-        place: x, y in metres.
+        place: in metres.
         inside: the named places around it, the smallest first.
         seconds: for how long it stood there in each window.
     """
 
-    place: tuple[float, float]
+    place: Vector3
     inside: tuple[str, ...]
     seconds: Pair
 

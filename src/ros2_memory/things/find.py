@@ -388,7 +388,7 @@ class _Finder:
             return
         stay, newest = stays[-1][-1]
         frame = self.known.frames[instance.epoch]
-        if self.where is not None and not self.where.contains(frame, *stay.at[:2]):
+        if self.where is not None and not self.where.contains(frame, stay.at):
             return
         rows = np.concatenate([part.rows for part in chain(*stays)])
         count = estimate.side_by_side(newest)
@@ -493,12 +493,11 @@ class _Finder:
         spots = self.known.estimate.spots[rows]
         spots = spots[stable_order(spots[:, Spot.LAST])]
         now = min(self.now, self.window.stop)
-        usual = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
+        usual = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y, Spot.Z]], now)
         if usual is None:
             return None
         return tuple(
-            replace(place, inside=places_at(self.places, frame, *place.place[:2]))
-            for place in usual
+            replace(place, inside=places_at(self.places, frame, place.place)) for place in usual
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:

@@ -102,8 +102,8 @@ class KnownThings:
         if where is None:
             return rows
         frame = self.frames[mover.epoch]
-        places = (self.estimate.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
-        return rows[[where.contains(frame, x, y) for x, y in places]]
+        places = (self.estimate.spots[rows][:, [Spot.X, Spot.Y, Spot.Z]] / 1000).tolist()
+        return rows[[where.contains(frame, (x, y, z)) for x, y, z in places]]
 
     def describe_stay(
         self, rows: Ints, place: Vector3, frame: str, places: Sequence[Place]
@@ -115,7 +115,7 @@ class KnownThings:
             end=int(spots[:, Spot.LAST].max()),
             place=place,
             count=int(self.estimate.counts[rows].sum()),
-            inside=places_at(places, frame, *place[:2]),
+            inside=places_at(places, frame, place),
         )
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.sights import STOREY_MM
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.counts.bins import Offset, local_offset
 from ros2_memory.results import UsualPlace
@@ -114,7 +115,7 @@ def _normalised(weights: Floats) -> Floats:
 
 
 def usual_places(
-    times: Ints, xy_mm: Ints, now: Ns, offset: Offset = local_offset
+    times: Ints, places_mm: Ints, now: Ns, offset: Offset = local_offset
 ) -> tuple[UsualPlace, ...] | None:
     """Returns where a thing usually is, the likeliest place now first; empty without a routine.
 
@@ -122,13 +123,13 @@ def usual_places(
 
     Args:
         times: when it was seen (N, ns), ascending.
-        xy_mm: where it was seen (N x 2, mm).
+        places_mm: where it was seen (N x 3, mm).
         now: the time that is asked about (ns).
         offset: of local time.
     """
     last_in_hour = np.flatnonzero(np.diff(times // _HOUR_NS, append=-1) != 0)
     hours = np.array([_local_hour(at, offset) for at in times[last_in_hour].tolist()])
-    places, centres = _cluster_places(xy_mm[last_in_hour])
+    places, centres = _cluster_places(places_mm[last_in_hour])
     hourly = _HourlyPlaces(hours, places, len(centres))
     days = hours // _DAY_H
     learned = int(np.searchsorted(days, days[0] + _LEARNED_DAYS))
@@ -145,10 +146,10 @@ def usual_places(
     order = [place for place in np.argsort(-likely_now).tolist() if shares[place] >= _LEAST_SHARE]
     usual = []
     for place in order[:_MOST_PLACES]:
-        x, y = (centres[place] / _MM).tolist()
+        x, y, z = (centres[place] / _MM).tolist()
         best_hours = np.flatnonzero(best_of_hour == place).tolist()
         share, chance = float(shares[place]), float(likely_now[place])
-        usual.append(UsualPlace((x, y, 0.0), (), share, _hours_text(best_hours), chance))
+        usual.append(UsualPlace((x, y, z), (), share, _hours_text(best_hours), chance))
     return tuple(usual)
 
 
@@ -164,21 +165,22 @@ def _local_hour(at: Ns, offset: Offset) -> float:
     return (at + offset(at // NS_PER_S) * NS_PER_S) / _HOUR_NS
 
 
-def _cluster_places(xy_mm: Ints) -> tuple[Ints, Floats]:
+def _cluster_places(places_mm: Ints) -> tuple[Ints, Floats]:
     """Returns the number of each position's place, and the mean of each place (mm).
 
-    A position joins the nearest place within a metre, else it begins a new one.
+    A position joins the nearest place of its storey within a metre, else it begins a new one.
     """
-    numbers = np.zeros(len(xy_mm), np.int64)
-    totals = np.zeros((len(xy_mm), 3))  # x, y and the number of positions of each place
+    numbers = np.zeros(len(places_mm), np.int64)
+    totals = np.zeros((len(places_mm), 4))  # x, y, z and the number of positions of each place
     size = 0
-    for row, position in enumerate(xy_mm):
-        apart = np.hypot(*(totals[:size, :2] / totals[:size, 2:] - position).T)
+    for row, position in enumerate(places_mm):
+        x, y, z = (totals[:size, :3] / totals[:size, 3:] - position).T
+        apart = np.where(np.abs(z) > STOREY_MM, np.inf, np.hypot(x, y))
         place = int(np.argmin(apart)) if size and apart.min() <= _ONE_PLACE_MM else size
         size = max(size, place + 1)
         totals[place] += (*position, 1.0)
         numbers[row] = place
-    return numbers, totals[:size, :2] / totals[:size, 2:]
+    return numbers, totals[:size, :3] / totals[:size, 3:]
 
 
 def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:

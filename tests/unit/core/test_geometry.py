@@ -14,13 +14,16 @@ from ros2_memory.core import geometry
 from ros2_memory.core.geometry import multiply, normalised, rpy, simplified, slerp
 from ros2_memory.core.model import Quaternion, Vector3
 from ros2_memory.core.regions import (
+    AnyOf,
     Circle,
     Place,
     Polygon,
     Rectangle,
     Region,
     Steps,
+    Storey,
     clipped,
+    contains,
     places_at,
 )
 from tests.support.strategies import angles, quaternions, ratios
@@ -158,15 +161,24 @@ HORSESHOE = Polygon(
 
 
 def steps(draw: Random) -> Steps:
-    points = np.array([(draw.uniform(-3, 6), draw.uniform(-3, 6)) for _ in range(301)])
+    points = np.array([[draw.uniform(-3, 6) for _ in range(3)] for _ in range(301)])
     points[5] = points[4]  # the robot stands
-    return Steps(points[:-1, 0], points[:-1, 1], points[1:, 0], points[1:, 1])
+    points[9, :2] = points[8, :2]  # it is in a lift
+    points[13, 2] = math.nan
+    return Steps(*points[:-1].T, *points[1:].T)
 
 
 @pytest.mark.parametrize(
     "region",
-    [Circle(1.0, 2.0, 1.5), Rectangle(-1.0, 2.0, 0.0, 3.0), HORSESHOE],
-    ids=lambda each: repr(each)[:6],
+    [
+        Circle(1.0, 2.0, 1.5),
+        Rectangle(-1.0, 2.0, 0.0, 3.0),
+        HORSESHOE,
+        Storey(HORSESHOE, 0.0, 2.0),
+        Storey(Circle(1.0, 2.0, 3.0), -math.inf, 1.0),
+        AnyOf((Storey(HORSESHOE, 2.0, 4.0), Storey(Rectangle(-1.0, 2.0, 0.0, 3.0), -1.0, 3.0))),
+    ],
+    ids=lambda each: repr(each)[:12],
 )
 @pytest.mark.parametrize("seed", range(2))
 def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) -> None:
@@ -178,12 +190,13 @@ def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) 
         step, share = draw.randrange(len(path.x)), draw.random()
         x = path.x[step] + (path.to_x[step] - path.x[step]) * share
         y = path.y[step] + (path.to_y[step] - path.y[step]) * share
+        z = path.z[step] + (path.to_z[step] - path.z[step]) * share
         mine = parts.step == step
         apart = np.abs(np.concatenate((parts.start[mine], parts.stop[mine])) - share)
         if len(apart) and apart.min() < 1e-9:
             continue  # on the border
         inside = bool(((parts.start[mine] <= share) & (share <= parts.stop[mine])).any())
-        assert inside == region.contains(x, y)
+        assert inside == contains(region, x, y, z)
 
 
 def test_of_places_within_each_other_the_smallest_is_named() -> None:
@@ -192,4 +205,4 @@ def test_of_places_within_each_other_the_smallest_is_named() -> None:
     bends = Polygon(tuple((x * 1.5, y * 1.5) for x, y in HORSESHOE.corners))
     for region in (Circle(1, 1, 0.5), bends, Circle(2.6, 2.6, 2.7)):
         places = (kitchen, Place("part", "map", region), Place("yard", "odom", region))
-        assert places_at(places, "map", 1.0, 1.0) == ("part", "kitchen")
+        assert places_at(places, "map", (1.0, 1.0, 0.0)) == ("part", "kitchen")

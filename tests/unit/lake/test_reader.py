@@ -18,7 +18,8 @@ from ros2_memory.lake.memory import LakeIndex
 from ros2_memory.lake.tables import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import Channel, Schema
-from tests.support.bags import Msg, detections, odom, text, write_mcap
+from tests.support import storeys
+from tests.support.bags import Msg, detections, odom, text, write_mcap, write_splits
 from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import (
     fleet_of,
@@ -31,6 +32,7 @@ from tests.support.lakes import (
     store_columns,
     write_bag,
 )
+from tests.support.memories import asked
 
 AT = START_S * NS_PER_S
 EVERYTHING = TimeWindow.everything()
@@ -58,6 +60,31 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(tmp_path: Path
         expected = reply(bags, tool, asked)
         assert "error" not in expected
         assert reply(lake, tool, asked) == expected
+
+
+def test_places_of_two_storeys_are_told_apart_by_a_lake_as_by_the_bags(tmp_path: Path) -> None:
+    write_splits(tmp_path / "bags", storeys.house(), 60)
+    robot = robot_bags("hall", tmp_path / "bags")
+    ship(tmp_path / "lake", [robot])
+    lake = lake_robot(
+        tmp_path / "lake", stores=tmp_path / "cache", now=round(storeys.END * NS_PER_S)
+    )
+    bags = replace(robot.memory, clock=lake.clock)
+    for tool, given in (
+        ("visits", {}),
+        ("visits", {"by": "place"}),
+        ("find_things", {"where": "bedroom"}),
+        ("recap", {"where": "kitchen", "start": storeys.BEGIN, "end": storeys.END}),
+    ):
+        of_bags, of_lake = (asked(storeys.with_places(one), tool, **given) for one in (bags, lake))
+        assert "error" not in of_bags
+        assert of_lake == of_bags
+    heights = [row["z"] for row in lake_rows(tmp_path / "lake", "poses")]
+    assert (min(heights), max(heights)) == (0.0, storeys.UP_M)
+    assert {row["robot_z"] for row in lake_rows(tmp_path / "lake", "sightings")} > {
+        0.0,
+        storeys.UP_M,
+    }
 
 
 def test_copies_among_images_are_told_by_their_publish_times(tmp_path: Path) -> None:

@@ -291,7 +291,7 @@ def month(seed: int, moves: float, is_at_home: float) -> tuple[Ints, Ints]:
             place = 0 if chance.random() < is_at_home else int(chance.integers(len(PLACES)))
         if 7 <= hour % 24 < 23 and chance.random() < 0.35:
             times.append(hour * HOUR + int(chance.integers(HOUR)))
-            seen.append(PLACES[place] + chance.normal(0, 80, 2).astype(np.int64))
+            seen.append([*(PLACES[place] + chance.normal(0, 80, 2).astype(np.int64)), 700])
     return np.array(times), np.array(seen)
 
 

@@ -11,11 +11,13 @@ from ros2_memory.things.routine import _cluster_places, _HourlyPlaces
 MM = st.integers(-20, 20).map(lambda step: 250 * step)
 
 
-@given(st.lists(st.tuples(MM, MM), min_size=1, max_size=40))
-def test_a_position_joins_the_nearest_place_within_a_metre(xy_mm: list[tuple[int, int]]) -> None:
-    places: list[list[tuple[int, int]]] = []
+@given(st.lists(st.tuples(MM, MM, st.sampled_from([0, 2700])), min_size=1, max_size=40))
+def test_a_position_joins_the_nearest_place_within_a_metre(
+    seen_mm: list[tuple[int, int, int]],
+) -> None:
+    places: list[list[tuple[int, int, int]]] = []
     numbers = []
-    for position in xy_mm:
+    for position in seen_mm:
         centres = [[sum(axis) / len(axis) for axis in zip(*place, strict=True)] for place in places]
         apart = [math.dist(centre, position) for centre in centres]
         nearest = min(range(len(apart)), key=apart.__getitem__, default=0)
@@ -24,7 +26,7 @@ def test_a_position_joins_the_nearest_place_within_a_metre(xy_mm: list[tuple[int
             places.append([])
         places[nearest].append(position)
         numbers.append(nearest)
-    found, centres_found = _cluster_places(np.array(xy_mm))
+    found, centres_found = _cluster_places(np.array(seen_mm))
     assert found.tolist() == numbers
     assert centres_found.tolist() == [np.mean(place, axis=0).tolist() for place in places]
 

@@ -1,7 +1,8 @@
 """The path of the robot in one frame with few vertices, each with its time.
 
 Vertices are poses. Between two vertices the robot is taken to move evenly. Every pose is within
-`TOLERANCE_M` of where the track has the robot *at its time*. So a track says where the robot was,
+`TOLERANCE_M` of where the track has the robot *at its time*, and within `TOLERANCE_OF_HEIGHT_M` of
+its height: more tells storeys apart, and fewer vertices do. So a track says where the robot was,
 and when it entered a region, which a path that is drawn in space alone does not.
 
 In each *slice* of the clock the first and the last pose are vertices, and so is the pose farthest
@@ -30,9 +31,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.frames import Floats
-    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.model import TimeWindow, Vector3
 
 TOLERANCE_M: Final = 0.05
+TOLERANCE_OF_HEIGHT_M: Final = 0.2
 TOLERANCE_RAD: Final = 0.15
 TRACK_SLICE_NS: Final = 10 * NS_PER_S
 _SLOT_NS: Final = NS_PER_S // 5
@@ -47,6 +49,7 @@ _PER_M: Final = 10_000
 """Vertices are rounded to 0.1 mm, as the store has poses."""
 _WEIGHT: Final = TOLERANCE_M / TOLERANCE_RAD
 """How many metres count as much as a radian."""
+_WEIGHT_OF_HEIGHT: Final = TOLERANCE_M / TOLERANCE_OF_HEIGHT_M
 _TURN: Final = 1 << 22
 """Headings are whole numbers of such parts of a turn, so that many turns add up exactly."""
 
@@ -59,6 +62,7 @@ class RobotTrack:
         times: log times (ns).
         x: metres.
         y: metres.
+        z: metres; NaN if it is not known.
         heading: yaw (rad), continuous from vertex to vertex; NaN if it is not known.
         begins: whether a piece begins at the vertex. Between pieces there is no pose for more than
             `SILENCE_NS`.
@@ -68,6 +72,7 @@ class RobotTrack:
     times: Ints
     x: Floats
     y: Floats
+    z: Floats
     heading: Floats
     begins: Flags
     fastest_mps: float = math.inf
@@ -82,13 +87,13 @@ class RobotTrack:
         """The first and the last time of each piece (ns, inclusive)."""
         return self.times[self.begins], self.times[self.ends]
 
-    def at(self, times: Ints) -> tuple[Floats, Floats, Floats]:
-        """Returns x, y (m) and heading (rad) at log times; the track has at least one vertex."""
+    def at(self, times: Ints) -> tuple[Floats, Floats, Floats, Floats]:
+        """Returns x, y, z (m) and heading (rad) at log times; the track has a vertex or more."""
         # Relative to the first vertex, a time is small enough to be exact as a float.
         since = self.times[0]
-        columns = (self.x, self.y, self.heading)
-        x, y, heading = (np.interp(times - since, self.times - since, axis) for axis in columns)
-        return x, y, heading
+        columns = (self.x, self.y, self.z, self.heading)
+        x, y, z, heading = (np.interp(times - since, self.times - since, axis) for axis in columns)
+        return x, y, z, heading
 
 
 class PartialTrack(NamedTuple):
@@ -98,6 +103,7 @@ class PartialTrack(NamedTuple):
         times: log times (ns), ascending.
         x: metres.
         y: metres.
+        z: metres; NaN if it is not known.
         turns: headings in parts of a turn (`_TURN`), continuous from vertex to vertex.
         known: whether the heading is known.
         settled: whether no other table can have a pose in the slice of the vertex.
@@ -108,6 +114,7 @@ class PartialTrack(NamedTuple):
     times: Ints
     x: Floats
     y: Floats
+    z: Floats
     turns: Ints
     known: Flags
     settled: Flags
@@ -117,12 +124,12 @@ class PartialTrack(NamedTuple):
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 300 + 34 * len(self.times)
+        return 300 + 42 * len(self.times)
 
     @property
-    def columns(self) -> tuple[Ints, Floats, Floats, Ints, Flags, Flags]:
+    def columns(self) -> tuple[Ints, Floats, Floats, Floats, Ints, Flags, Flags]:
         """The arrays of its vertices."""
-        return self[:6]
+        return self[:7]
 
     def vertices(self, index: NDArray[np.intp]) -> PartialTrack:
         """Returns the vertices at an index array, in the order given."""
@@ -178,22 +185,21 @@ def _is_last(is_first: Flags) -> Flags:
     return np.append(is_first[1:], [True])[: len(is_first)]
 
 
-def partial_track(
-    times: Ints, x: Floats, y: Floats, heading: Floats, left_out: int = 0
-) -> PartialTrack:
+def partial_track(times: Ints, x: Floats, y: Floats, z: Floats, heading: Floats) -> PartialTrack:
     """Returns the track of a table of poses in log-time order.
 
-    Poses with NaN or a coordinate beyond `_MAX_M` are no place, and dropped.
+    Poses with x or y NaN or beyond `_MAX_M` are no place, and dropped; such a z is not known.
     """
     rows = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))
     rows = rows[slot_ends(times[rows])]
     times, heading = times[rows], heading[rows]
-    x, y = (np.rint(column[rows] * _PER_M) / _PER_M for column in (x, y))
+    x, y, z = (np.rint(column[rows] * _PER_M) / _PER_M for column in (x, y, z))
+    z = np.where(np.abs(z) < _MAX_M, z, np.nan)
     known = np.isfinite(heading)
     turns = np.rint(np.where(known, heading, 0.0) / math.tau * _TURN).astype(np.int64)
     settled = _in_inner_slice(times)
     turns = _continuous(turns, np.zeros(len(times), np.bool_))
-    part = PartialTrack(times, x, y, turns, known, settled, left_out)
+    part = PartialTrack(times, x, y, z, turns, known, settled, 0)
     return part.vertices(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
 
 
@@ -205,9 +211,9 @@ def _in_inner_slice(times: Ints) -> Flags:
     return is_inner
 
 
-def track_of(times: Ints, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
+def track_of(times: Ints, x: Floats, y: Floats, z: Floats, heading: Floats) -> RobotTrack:
     """Returns the track of all poses (m, rad), which are in log-time order."""
-    return track_by(*joined_tracks([[partial_track(times, x, y, heading)]]))
+    return track_by(*joined_tracks([[partial_track(times, x, y, z, heading)]]))
 
 
 def track_by(whole: PartialTrack, recordings: Ints, fastest_mps: float = math.inf) -> RobotTrack:
@@ -220,7 +226,7 @@ def track_by(whole: PartialTrack, recordings: Ints, fastest_mps: float = math.in
     turns = _continuous(whole.turns, ~_is_new(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
-    return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
+    return RobotTrack(whole.times, whole.x, whole.y, whole.z, heading, begins, fastest_mps)
 
 
 def joined_tracks(
@@ -234,7 +240,7 @@ def joined_tracks(
     parts_in_order = [part for parts in recordings for part in parts]
     if not parts_in_order:
         times, empty = np.zeros(0, np.int64), np.zeros(0)
-        return partial_track(times, empty, empty, empty), times
+        return partial_track(times, empty, empty, empty, empty), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
     columns = map(np.concatenate, zip(*(part.columns for part in parts_in_order), strict=True))
     whole = PartialTrack._make((*columns, 0, ""))
@@ -276,18 +282,19 @@ def _vertices(part: PartialTrack, keeps: Flags, recordings: Ints) -> NDArray[np.
     is_first = _is_new(times // TRACK_SLICE_NS, recordings)
     is_vertex = keeps | is_first | _is_last(is_first)
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
+    raised = part.z * _WEIGHT_OF_HEIGHT
     waiting = np.flatnonzero(~is_vertex)
     while waiting.size:
         vertices = np.flatnonzero(is_vertex)
         after = np.searchsorted(vertices, waiting)
         start, end = vertices[after - 1], vertices[after]
         share = (times[waiting] - times[start]) / np.maximum(times[end] - times[start], 1)
-        squared = np.zeros(waiting.size)
-        for column in (part.x, part.y):
-            away = column[waiting] - column[start] - (column[end] - column[start]) * share
-            squared += away * away
-        away = turned[waiting] - turned[start] - (turned[end] - turned[start]) * share
-        squared = np.maximum(squared, away * away)
+        x, y, turn, rise = (
+            (column[waiting] - column[start] - (column[end] - column[start]) * share) ** 2
+            for column in (part.x, part.y, turned, raised)
+        )
+        # A height that is not known is near any other.
+        squared = np.fmax(np.maximum(x + y, turn), rise)
         first = run_starts(after)
         worst = np.maximum.reduceat(squared, first)
         worst_here = np.repeat(worst, np.diff(first, append=waiting.size))
@@ -308,8 +315,8 @@ def jumps(track: RobotTrack) -> Flags:
     return np.append(jumped, [False])[: len(track.times)]
 
 
-def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, float] | None:
-    """Returns where the robot was (x, y in m) at a log time; None before the track.
+def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> Vector3 | None:
+    """Returns where the robot was (m) at a log time; None before the track.
 
     After the end of a piece it stays there for `silence` (ns), or until the next one begins; None
     after that.
@@ -319,12 +326,18 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
         return None
     before = after - 1
     since = time - int(track.times[before])
+    share = 0.0
     if after == len(track.times) or track.begins[after]:
-        return (float(track.x[before]), float(track.y[before])) if since <= silence else None
-    share = since / int(track.times[after] - track.times[before])
-    x = track.x[before] + (track.x[after] - track.x[before]) * share
-    y = track.y[before] + (track.y[after] - track.y[before]) * share
-    return float(x), float(y)
+        if since > silence:
+            return None
+        after = before
+    else:
+        share = since / int(track.times[after] - track.times[before])
+    x, y, z = (
+        float(axis[before] + (axis[after] - axis[before]) * share)
+        for axis in (track.x, track.y, track.z)
+    )
+    return x, y, z
 
 
 def cut_track(track: RobotTrack, window: TimeWindow) -> RobotTrack:
@@ -339,5 +352,5 @@ def cut_track(track: RobotTrack, window: TimeWindow) -> RobotTrack:
         at, begins = np.append(window.start, at), np.append(False, begins)
     if last < len(times) and not track.begins[last] and at[-1:].tolist() != [window.stop - 1]:
         at, begins = np.append(at, window.stop - 1), np.append(begins, False)
-    places = track.at(at) if at.size else (track.x[:0], track.y[:0], track.heading[:0])
+    places = track.at(at) if at.size else (track.x[:0],) * 4
     return RobotTrack(at, *places, begins, track.fastest_mps)

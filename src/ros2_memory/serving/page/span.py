@@ -21,7 +21,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Circle, Place, Polygon
+from ros2_memory.core.regions import Circle, Place, Polygon, plan_of
 from ros2_memory.core.reply import (
     INSIDE,
     PAIRS,
@@ -434,7 +434,7 @@ def _newest_pose(track: RobotTrack) -> JsonObject | None:
 
 def _place_outline(place: Place) -> JsonObject:
     """Returns a named place as a circle or as corners."""
-    match place.region:
+    match plan_of(place.region):
         case Circle(x, y, radius_m):
             return {"name": place.name, "circle": [x, y, radius_m]}
         case Polygon(corners=given):
