@@ -13,6 +13,7 @@ before or after it was last seen.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
@@ -39,6 +40,8 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, NS_PER_US
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from ros2_memory.core.model import Vector3
 
 Floats: TypeAlias = NDArray[np.float64]
 _Sums: TypeAlias = tuple[int, int, int]
@@ -265,6 +268,12 @@ def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     topic = np.zeros(len(slices), np.int64)
     rows = (slices, topic, x_mm, y_mm, *turns, by.sizes, first, last, z_mm, lean)
     return look, np.stack(rows, axis=1)
+
+
+def apart_m(one: Vector3, other: Vector3) -> float:
+    """Returns how far (m) two points are apart in the plane; infinite for those on two floors."""
+    above_mm = abs(one[2] - other[2]) * 1000
+    return math.dist(one[:2], other[:2]) if above_mm <= STOREY_MM else math.inf
 
 
 def height_cells(z_mm: Ints) -> Ints:

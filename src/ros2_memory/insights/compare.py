@@ -15,7 +15,6 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from itertools import chain, islice, zip_longest
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
 from ros2_memory.analysis.motion.trajectory import length_notes
-from ros2_memory.analysis.sights import Spot
+from ros2_memory.analysis.sights import Spot, apart_m
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place, places_at
@@ -313,7 +312,7 @@ class _StayInWindow(NamedTuple):
 
     def is_elsewhere(self, other: _StayInWindow) -> bool:
         """Returns whether a thing was moved between two stays: to and fro is no move."""
-        away_m = math.dist(self.part.place[:2], other.part.place[:2])
+        away_m = apart_m(self.part.place, other.part.place)
         return self.stay.place != other.stay.place and away_m >= LEAST_MM / 1000
 
 
@@ -441,7 +440,7 @@ class _ThingsBetween:
             after = self._last_seen(mover, self.later)
             befores, afters = alone.setdefault(label, ([], []))
             if before is not None and after is not None:
-                away_m = math.dist(before.place[:2], after.place[:2])
+                away_m = apart_m(before.place, after.place)
                 if before.at_once != after.at_once or away_m > _SAME_MOVER_M:
                     yield ComparedMover(label, before, after)
             elif before is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, STOREY_MM, Spot, bin_of
+from ros2_memory.analysis.sights import SCORE_BINS, Spot, apart_m, bin_of
 from ros2_memory.core.arrays import stable_order
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
@@ -267,7 +267,7 @@ class Near(NamedTuple):
             near: list[tuple[float, Vector3]] = []
             for place in thing.places:
                 points = self._points_for(thing, place, landmarks)
-                away_m = min((math.dist(place[:2], point) for point in points), default=math.inf)
+                away_m = min((apart_m(place, point) for point in points), default=math.inf)
                 if away_m <= self.circle.radius_m:
                     near.append((away_m, place))
             if not near:
@@ -280,19 +280,15 @@ class Near(NamedTuple):
 
     def _points_for(
         self, thing: _FoundThing, place: Vector3, landmarks: Sequence[_FoundThing]
-    ) -> list[tuple[float, float]]:
-        """Returns the points (m) that a thing at a place may be near.
-
-        No thing is near itself, or near one on another floor.
-        """
+    ) -> list[Vector3]:
+        """Returns the points (m) that a thing at a place may be near; no thing is near itself."""
         if not self.label:
-            return [(self.circle.x, self.circle.y)]
+            return [(self.circle.x, self.circle.y, place[2])]
         return [
-            (x, y)
+            point
             for landmark in landmarks
             if landmark.thing is not thing.thing and landmark.thing.epoch == thing.thing.epoch
-            for x, y, z in landmark.places
-            if abs(z - place[2]) * 1000 <= STOREY_MM
+            for point in landmark.places
         ]
 
     def describe_lack(

@@ -1,13 +1,14 @@
 """Places with a height: where the robot and things are in a house of two storeys."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ros2_memory.history.context import Memory
-from tests.support.bags import write_splits
-from tests.support.memories import asked, memory_of
-from tests.support.storeys import BEGIN, END, HOUSE, S, house, times_in, with_places
+from tests.support.bags import detected, odom, write_splits
+from tests.support.memories import asked, memory_of, remembered
+from tests.support.storeys import BEGIN, END, HOUSE, UP_M, S, house, times_in, with_places
 from tests.support.tables import table
 
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
@@ -73,3 +74,17 @@ def test_what_differs_is_in_the_place_of_its_storey(memory: Memory) -> None:
     of_kitchen = asked(memory, "compare", where="kitchen", **given)
     assert [*of_kitchen["minutes"]] == ["kitchen"]
     assert [row["was"]["in"] for row in of_kitchen["things"]["not_looked_at"]] == ["kitchen"]
+
+
+def test_what_was_carried_to_the_storey_above_was_moved(tmp_path: Path) -> None:
+    """To the same x and y, as a ball on a gallery."""
+    messages = []
+    for second in range(120):
+        at = (BEGIN + second) * S
+        ball = ("ball", 0.9, (2.0, 0.0, 0.3 if second < 60 else UP_M + 0.3))
+        messages += [odom(at), detected(at, [ball], frame="odom")]
+    memory = with_places(remembered(tmp_path, messages))
+    given = {"start": BEGIN + 60, "end": BEGIN + 120, "with_start": BEGIN, "with_end": BEGIN + 59}
+    things = asked(memory, "compare", **given)["things"]
+    [moved] = things["moved"]
+    assert (moved["was"]["in"], moved["is"]["in"]) == ("kitchen", "bedroom")
