@@ -1,14 +1,33 @@
 """Places with a height: where the robot and things are in a house of two storeys."""
 
+import random
+from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
+from ros2_memory.analysis.intervals import FLICKER_NS
+from ros2_memory.core.regions import Circle, Storey
 from ros2_memory.history.context import Memory
-from tests.support.bags import detected, odom, write_splits
-from tests.support.memories import asked, memory_of, remembered
-from tests.support.storeys import BEGIN, END, HOUSE, UP_M, S, house, times_in, with_places
+from tests.support.bags import detected, odom, tf, transform, write_splits
+from tests.support.examples import examples
+from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.storeys import (
+    BEGIN,
+    END,
+    HOUSE,
+    TIMES,
+    UP_M,
+    WAY,
+    S,
+    house,
+    times_in,
+    with_places,
+)
 from tests.support.tables import table
 
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
@@ -88,3 +107,64 @@ def test_what_was_carried_to_the_storey_above_was_moved(tmp_path: Path) -> None:
     things = asked(memory, "compare", **given)["things"]
     [moved] = things["moved"]
     assert (moved["was"]["in"], moved["is"]["in"]) == ("kitchen", "bedroom")
+
+
+@each_way
+@pytest.mark.parametrize(
+    "of_body", [False, True], ids=["odometry in the plane", "transforms alone"]
+)
+def test_transforms_to_the_map_have_heights(
+    tmp_path: Path, *, of_body: bool, recalls: bool
+) -> None:
+    messages = []
+    for at, (x, z) in zip(TIMES, WAY, strict=True):
+        own = tf(at, transform(at, "odom", "base_link", (x, 0.0, 0.0))) if of_body else odom(at, x)
+        messages += [tf(at, transform(at, "map", "odom", (0.0, 0.0, z))), own]
+    memory = with_places(remembered(tmp_path, messages, recalls=recalls), frame="map")
+    for name in HOUSE:
+        [row] = asked(memory, "visits", where=name)["visits"]
+        inside = times_in(name)
+        assert row["arrived"] == pytest.approx(inside[0] / S, abs=0.21)
+        assert row.get("departed", END) == pytest.approx(inside[-1] / S, abs=0.21)
+    span = {"start": BEGIN, "end": END}
+    for second, name in ((20, "kitchen"), (100, "bedroom")):
+        assert asked(memory, "get_position_at", timestamp=BEGIN + second)["in"] == name
+    assert asked(memory, "recap", where="bedroom", **span)["inside_s"] == pytest.approx(62, abs=1)
+
+
+@settings(max_examples=examples(25))
+@given(seed=st.integers(0, 2**32), stored=st.booleans())
+def test_visits_last_from_the_first_to_the_last_pose_at_the_heights_of_the_place(
+    seed: int, stored: bool
+) -> None:
+    """In a lift that goes at any speed, stops anywhere, and may turn back."""
+    draw = random.Random(seed)
+    z, way = 0.0, []
+    for _ in range(draw.randrange(2, 12)):
+        speed, length = draw.choice([0.0, 0.3, -0.3, 1.1, -1.1, 3.0, -3.0]), draw.randrange(5, 100)
+        for _ in range(length):
+            z += speed / 5
+            way.append((z, draw.uniform(-0.02, 0.02)))
+    low, high = sorted((draw.uniform(-5, 5), draw.uniform(-5, 5)))
+    poses = [(BEGIN * S + nth * S // 5, z + off) for nth, (z, off) in enumerate(way)]
+    # The track is within 20 cm of each height.
+    deep = {at: min(height - low, high - height) for at, height in poses}
+    runs = [[*run] for _, run in groupby(deep, key=lambda at: deep[at] >= 0)]
+    stays: list[list[int]] = []
+    for nth, run in enumerate(runs):
+        assume(max(abs(deep[at]) for at in run) > 0.25)
+        lasted = run[-1] - run[0] + 2 * S // 5
+        is_inner = 0 < nth < len(runs) - 1
+        assume(not (is_inner and abs(lasted - FLICKER_NS) < 2 * S))
+        if deep[run[0]] < 0:
+            continue
+        if stays and run[0] - stays[-1][1] < FLICKER_NS:
+            stays[-1][1] = run[-1]
+        else:
+            stays.append([run[0], run[-1]])
+    with TemporaryDirectory() as folder:
+        memory = remembered(Path(folder), [odom(at, z=z) for at, z in poses], recalls=stored)
+        rooms = with_places(memory, {"room": Storey(Circle(0.0, 0.0, 1.0), low, high)})
+        rows = asked(rooms, "visits", where="room", limit=100)["visits"]
+    found = [(row["arrived"], row.get("departed", poses[-1][0] / S)) for row in reversed(rows)]
+    assert found == [pytest.approx((first / S, last / S), abs=1e-3) for first, last in stays]
