@@ -153,7 +153,7 @@ def _describe_undated(view: View, window: TimeWindow) -> Iterator[str]:
     snapshot = view.snapshot
     faults = [fault for fault in snapshot.misdated if fault.may_be_of(window)]
     if faults and any(is_missed(snapshot, window, *gap) for gap in view.gaps(window)):
-        yield describe_misdated(faults, " may be of this time")
+        yield describe_misdated(faults, ", and may be of this time")
 
 
 def _are_losses_hidden(bag_dir: Path) -> bool:

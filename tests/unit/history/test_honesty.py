@@ -398,7 +398,7 @@ def test_a_gap_in_which_a_robot_may_have_driven_with_a_wrong_clock_says_so(tmp_p
 
     def is_noted(tool: str, begin: float, end: float, **arguments: object) -> bool:
         told = asked(memory, tool, start=T0_S + begin, end=T0_S + end, **arguments)
-        note = "1 bag dated by a wrong clock may be of this time: boot/boot_0.mcap"
+        note = "dated by a wrong clock, and may be of this time: boot/boot_0.mcap"
         return note in str(told.get("notes"))
 
     for tool in ("trajectory_summary", "recap"):
