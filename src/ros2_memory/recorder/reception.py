@@ -131,12 +131,14 @@ class _Recording:
         refused: topics with a publisher that the subscription does not fit.
         asked_anew: topics whose subscription fits every publisher.
         span: the first and the last log time (ns); None before the first split.
+        newest: the same of its newest split, and of the seconds before that.
     """
 
     plan: QueuePlan
     asked_anew: frozenset[str]
     refused: set[str] = field(default_factory=set)
     span: Span | None = None
+    newest: Span | None = None
 
 
 class _Anew(NamedTuple):
@@ -257,7 +259,7 @@ class Reception:
         self.background.add(_TASK, self._flush)
 
     def note_lost(self, recording: str, topic: str, count: int, lived: Span) -> None:
-        """Notes that rosbag2 reports lost messages of a topic, up to a recording's last split.
+        """Notes that rosbag2 reports lost messages of a topic, since it last did so for a split.
 
         `lived`: when the recording ran (wall time), for one of which no split shows it.
         """
@@ -271,8 +273,8 @@ class Reception:
     def _add_reported(self, recording: str, topic: str, count: int, lived: Span) -> None:
         with self._lock:
             state = self._recordings.get(recording)
-            span = None if state is None else state.span
-            start, stop = span or lived
+            newest = None if state is None else state.newest
+            start, stop = sorted(newest or lived)  # the clock may have been set back
             losses = self._losses.add_reported(topic, start, stop, count)
         self._report_losses(losses)
 
@@ -406,7 +408,7 @@ class Reception:
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())
             if state is not None and split.arrivals:
-                self._add_refused(state, split.start, split.end)
+                self._note_split(state, split.start, split.end)
             if recording:
                 self._arrivals.add_split(split)
                 losses = self._losses.add_split(recording, split.progress)
@@ -428,17 +430,17 @@ class Reception:
                 if not flow.offered.reliable:
                     self._asked_anew[topic] = _Anew(best_effort=True)
 
-    def _add_refused(self, recording: _Recording, start: Ns, end: Ns) -> None:
-        """Adds the time of a split as a loss of each topic with a refused publisher."""
+    def _note_split(self, recording: _Recording, start: Ns, end: Ns) -> None:
+        """Notes the time of a split, which is lost to each topic with a refused publisher."""
         since = first = start
         if recording.span is not None:
-            # rosbag2 reports a publisher late: the loss begins before the split.
+            # rosbag2 reports what is lost late: it may have been before the split.
             first, last = recording.span
             first = min(first, start)  # the clock was set back
             since = max(first, min(last, start) - _UNNOTICED_NS)
         for topic in sorted(recording.refused):
             self._unwritten.append(Loss(topic, since, end + 1, 0, "refused"))
-        recording.span = first, end
+        recording.span, recording.newest = (first, end), (since, end)
 
 
 def newest_splits(bag_dir: Path, own: OwnRecordings) -> list[Path]:

@@ -42,7 +42,7 @@ from ros2_memory.recorder.reception import (
 )
 from ros2_memory.storage.base import Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
 from tests.support.simulated_recorders import Inline
 
 NS = 10**9
@@ -275,6 +275,21 @@ def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
     made.note_lost("a", "/odom", 7, (0, 1))
     [loss] = read_losses(tmp_path, MIN_NS, MAX_NS)
     assert (loss.topic, loss.lost, loss.by) == ("/odom", 7, "rosbag2")
+
+
+def test_what_rosbag2_reports_is_of_the_split_since_its_last_report(
+    tmp_path: Path, made: Reception
+) -> None:
+    for number in range(4):
+        begin = T0 + number * 10 * NS
+        path = tmp_path / f"a_{number}.mcap"
+        made.learn("a", write_mcap(path, [boolean(begin + n * NS, True) for n in range(11)]))
+        made.note_lost("a", "/door", 3, (0, 1))
+    assert sum(loss.lost for loss in read_losses(tmp_path, T0, T0 + NS)) == 3
+    # It may report them late, from the split before.
+    assert sum(loss.lost for loss in read_losses(tmp_path, T0 + 28 * NS, T0 + 29 * NS)) == 6
+    made.note_lost("b", "/door", 3, (T0, T0 - 60 * NS))  # the clock was set back
+    assert sum(loss.lost for loss in read_losses(tmp_path, T0 - 9 * NS, T0 - NS)) == 3
 
 
 def test_the_newest_splits_of_an_earlier_run_are_found_also_after_a_clock_that_was_ahead(
