@@ -527,22 +527,23 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         offered = offered_by_all(messages.offered_texts)
         if offered is None or not messages.published:
             continue
-        burst = largest_burst(messages.published)
+        burst = largest_burst(messages.published, summary.end - messages.last)
         split.flows[topic] = TopicFlow(offered, burst, messages.largest)
         if is_whole and messages.value_reader is not None and offered.publishers == 1:
             split.progress[topic] = Progress(messages.value_reader.kind, messages.positions)
     return split
 
 
-def largest_burst(published: Sequence[Ns]) -> int:
+def largest_burst(published: Sequence[Ns], silent: Ns) -> int:
     """Returns the most messages within `HOLD_S`, by their publish times; there must be one.
 
-    A topic that did not last for `HOLD_S` may have just started: its rate is extrapolated.
+    A topic that did not last for `HOLD_S` may have just started: its rate is extrapolated, unless
+    it has been `silent` for longer than it lasted (ns), as after a burst of a log.
     """
     ordered = sorted(published)
     counts = [nth - bisect_right(ordered, time - _HOLD_NS) for nth, time in enumerate(ordered, 1)]
     lasted = ordered[-1] - ordered[0]
-    if len(ordered) >= _FEWEST and 0 < lasted < _HOLD_NS:
+    if len(ordered) >= _FEWEST and silent < lasted < _HOLD_NS:
         extrapolated = -(-(len(ordered) - 1) * _HOLD_NS // lasted)
         return max(*counts, extrapolated)
     return max(counts)

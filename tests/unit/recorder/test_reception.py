@@ -42,7 +42,7 @@ from ros2_memory.recorder.reception import (
 )
 from ros2_memory.storage.base import Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, boolean, in_order, odom, text, write_mcap
 from tests.support.simulated_recorders import Inline
 
 NS = 10**9
@@ -275,6 +275,20 @@ def test_where_no_holes_are_sought_any_more_what_rosbag2_reports_is_missing(
     made.note_lost("a", "/odom", 7, (0, 1))
     [loss] = read_losses(tmp_path, MIN_NS, MAX_NS)
     assert (loss.topic, loss.lost, loss.by) == ("/odom", 7, "rosbag2")
+
+
+@pytest.mark.parametrize(
+    ("begun", "number", "gap", "depth"),
+    [(T0, 8, NS // 10**6, 16), (T0 + NS * 99 // 10, 20, NS // 200, 800)],
+)
+def test_a_burst_of_a_log_is_no_rate_as_is_that_of_a_topic_that_just_began(
+    tmp_path: Path, made: Reception, begun: int, number: int, gap: int, depth: int
+) -> None:
+    said = [text(begun + n * gap, "line", "/rosout") for n in range(number)]
+    others = [odom(T0 + n * NS // 10, 1.0, 2.0) for n in range(100)]
+    made.learn("a", write_mcap(tmp_path / "a_0.mcap", in_order([*said, *others])))
+    assert profiles(made, "b")["/rosout"]["depth"] == depth
+    assert made.cut_short == frozenset()
 
 
 def test_what_rosbag2_reports_is_of_the_split_since_its_last_report(
