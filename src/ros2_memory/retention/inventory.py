@@ -178,7 +178,7 @@ class Inventory:
         self._drop_other_device()
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self.root)
-        foreign_bytes = 0
+        foreign_bytes, saved = 0, self._saved_sizes(known)
         recordings: set[str] = set()
         judge = None
         if self.own is not None:
@@ -204,13 +204,13 @@ class Inventory:
             if may_go and path not in remaining:
                 bags.append(bag)
             elif self._counts(state, bag):
-                other_bytes += sum(file.size for file in bag.files)
+                other_bytes += sum(file.size for file in bag.files if file.inode not in saved)
         other_bytes += sum(self._folder_of(name, known.now).size for name in recordings)
         return DirContents(
             bags,
             known.now,
             other_bytes,
-            saved=self._saved_sizes(known),
+            saved=saved,
             foreign_bytes=foreign_bytes,
             state_bytes=state_bytes,
         )

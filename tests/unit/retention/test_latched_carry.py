@@ -24,7 +24,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.fakes import broken, killed_at
-from tests.support.housekeepers import files_in, keeper_of
+from tests.support.housekeepers import files_in, keeper_of, made_moment, size_of
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of
 from tests.support.noting_reader import fail_reading
@@ -134,6 +134,19 @@ def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(tmp_path: Pat
     assert files_in(tmp_path) == left
     keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
     assert "rec/rec_0.mcap" not in files_in(tmp_path)
+
+
+def test_a_bag_that_stays_for_a_while_and_is_saved_in_a_moment_counts_once(tmp_path: Path) -> None:
+    at_home(tmp_path, splits=4)
+    saved = made_moment(tmp_path / "moments" / "m") / "rec" / "rec_0.mcap"
+    saved.parent.mkdir()
+    saved.hardlink_to(tmp_path / "rec/rec_0.mcap")
+    budget = size_of(tmp_path) + saved.stat().st_size - 1
+    keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=25 / 3600, grace_s=10**6)
+    for _ in range(2):
+        keeper.apply()
+        assert len([*(tmp_path / "rec").iterdir()]) == 4
+    assert keeper.status().counted_bytes == size_of(tmp_path) <= budget
 
 
 def test_after_a_kill_the_carried_bag_is_the_recorder_s_own(tmp_path: Path) -> None:
