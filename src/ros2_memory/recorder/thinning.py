@@ -37,6 +37,7 @@ from ros2_memory.columns.plan import fields_at, is_time
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.arrays import numbered, run_starts
 from ros2_memory.core.model import BagState
+from ros2_memory.core.spans import lies_inside, united
 from ros2_memory.core.text import NAMES_IN_MESSAGES, looks_like_json
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span
 from ros2_memory.index.clock_faults import FaultyClock
@@ -543,20 +544,17 @@ def with_shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -
         snapshot: the index of all bags.
         bags: the bags of the snapshot that are about to be deleted, at least one.
     """
-
-    def is_inside(at: Ns) -> bool:
-        return any(bag.start <= at <= bag.end for bag in bags)
-
+    times = united((bag.start, bag.end + 1) for bag in bags)
     silences = [snapshot.prolonged(Silence._make(silence)) for silence in known.silences]
-    silences += [silence for silence in snapshot.silences if is_inside(silence.start)]
+    silences += [silence for silence in snapshot.silences if lies_inside(times, silence.start)]
     by_start = {(silence.topic, silence.start): (*silence,) for silence in silences}
     steps = [
         (fault.at, fault.by)
         for fault in snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK
-        if fault.by >= SHORTEST_STEP_NS and is_inside(fault.at)
+        if fault.by >= SHORTEST_STEP_NS and lies_inside(times, fault.at)
     ]
-    pauses = [pause.span for pause in snapshot.suspects if is_inside(pause.start)]
+    pauses = [pause.span for pause in snapshot.suspects if lies_inside(times, pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
     since = bags[0].start if known.since is None else known.since
     if since > snapshot.scanned_at:  # by a clock that was ahead
