@@ -99,17 +99,22 @@ class Share:
     Attributes:
         most: how many bytes.
         key: the setting that limits them.
-        stored: the sizes of the files that they have, by inode.
+        stored: the sizes of the files that they have, by inode; `used` is their sum.
     """
 
     most: int
     key: str = _SHARE
     stored: dict[int, int] = field(default_factory=dict)
+    used: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.used = sum(self.stored.values())
 
     def take(self, inode: int, size: int) -> bool:
         """Adds a file if there is room for it; returns whether it is among those stored."""
-        if inode not in self.stored and sum(self.stored.values()) + size <= self.most:
+        if inode not in self.stored and self.used + size <= self.most:
             self.stored[inode] = size
+            self.used += size
         return inode in self.stored
 
     def refusal(self, files: Iterable[tuple[int, int]], expected: int = 0) -> str | None:
@@ -117,7 +122,7 @@ class Share:
 
         `files` are inodes and sizes (bytes), `expected` the bytes of open files.
         """
-        used = sum(self.stored.values())
+        used = self.used
         new = {inode: size for inode, size in files if inode not in self.stored}
         more = sum(new.values()) + expected
         if used + more <= self.most:
