@@ -509,9 +509,9 @@ def _excluded_before(state: ScreenState) -> list[Excluded]:
 def _joined(spans: Spans) -> Spans:
     """Returns few spans that cover these: those that are closest to each other are joined."""
     spans = united(spans)
-    while len(spans) > MOST_EXCLUDED:
-        spans = united(spans, min(start - stop for (_, stop), (start, _) in pairwise(spans)))
-    return spans
+    gaps = sorted(start - stop for (_, stop), (start, _) in pairwise(spans))
+    too_many = len(spans) - MOST_EXCLUDED
+    return united(spans, gaps[too_many - 1]) if too_many > 0 else spans
 
 
 def _file_name(path: Path) -> str:
