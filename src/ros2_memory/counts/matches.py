@@ -259,9 +259,9 @@ def _label_held(
     if field and not all(_is_label(view, topic, field, binned.counted) for topic in topics):
         return None
     matches = condition.is_on
-    # What was in view just before the window does not begin in it.
+    # What was in view just before the window does not begin in it, nor end before its end.
     if scope.is_bounded or condition.min_score or len(topics) > 1:
-        seen = read_labels(view, topics, scope.begun_before(FLICKER_NS), condition, matches)
+        seen = read_labels(view, topics, scope.widened(FLICKER_NS), condition, matches)
         visible, since = seen.visible, seen.since
     else:
         events, since = _events_in_order(view, topics[0], binned.counted.widened(FLICKER_NS))

@@ -314,18 +314,19 @@ class Scope:
         known = placed_times(known_track.track, mixed)
         self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
 
-    def begun_before(self, by: Ns) -> Scope:
-        """Returns the scope of a window that begins `by` earlier.
+    def widened(self, by: Ns) -> Scope:
+        """Returns the scope of a window that is longer at either end.
 
-        Before this one the robot is in the place if it is there when this one begins.
+        What is added there is in the place if that end of this window is.
         """
-        earlier = copy(self)
-        start = self.window.start - by
-        earlier.window = replace(self.window, start=start)
-        if self._inside and self._inside[0][0] <= self.window.start:
-            (_, stop), *later = self._inside
-            earlier._inside = [(start, stop), *later]
-        return earlier
+        wider, old = copy(self), self.window
+        wider.window = new = old.widened(by)
+        if self._inside is not None:
+            wider._inside = [
+                (new.start if start <= old.start else start, new.stop if stop >= old.stop else stop)
+                for start, stop in self._inside
+            ]
+        return wider
 
     @property
     def compared_frames(self) -> tuple[str, ...]:

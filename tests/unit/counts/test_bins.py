@@ -431,7 +431,7 @@ def cups(at: int, *numbers: int) -> Msg:
 
 
 @each_way
-def test_a_thing_in_view_as_a_window_begins_does_not_begin_there_whatever_else_is_asked(
+def test_a_thing_in_view_as_a_window_begins_or_ends_is_so_whatever_else_is_asked(
     tmp_path: Path, recalls: bool
 ) -> None:
     """With a score or a place that it had all the time it counted as come into view."""
@@ -442,10 +442,15 @@ def test_a_thing_in_view_as_a_window_begins_does_not_begin_there_whatever_else_i
     sought = {"topic": "/vision/*/*", "condition_type": "contains", "value": "cup", "by": "hour"}
     here: dict[str, Any] = {"where": {"x": [-1, 1], "y": [-1, 1]}}
     for scope in ({}, {"min_score": 0.5}, here):
-        for start, count, seconds in ((20.5, 0, 18.5), (-5, 1, 39.0), (40.5, 0, 0.0)):
-            window = {"start": T + start, "end": T + 59}
+        for start, end, *expected in (
+            (20.5, 59, 0, 18.5),
+            (20.5, 30.5, 0, 10.0),
+            (-5, 59, 1, 39.0),
+            (40.5, 59, 0, 0.0),
+        ):
+            window = {"start": T + start, "end": T + end}
             whole = table(asked(memory, "find_matches", **sought, **window, **scope))["all"]
-            assert (whole["count"], whole["seconds"]) == (count, seconds)
+            assert [whole["count"], whole["seconds"]] == expected
 
 
 @each_way
