@@ -358,7 +358,11 @@ def _growth_per_day(snapshot: Snapshot, foreign: Collection[str]) -> int | None:
     """
     latest = snapshot.dating.latest or 0
     recent = takewhile(lambda bag: bag.end >= latest - _GROWTH_NS, reversed(snapshot.bags))
-    own = [bag for bag in recent if not (bag.file in foreign or is_thinned(bag.file))]
+    own = [
+        bag
+        for bag in recent
+        if bag.start <= latest and not (bag.file in foreign or is_thinned(bag.file))
+    ]
     span = latest - min((bag.start for bag in own), default=latest)
     if span < _LEAST_GROWTH_NS:
         return None

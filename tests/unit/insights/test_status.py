@@ -42,6 +42,7 @@ from tests.support.memories import asked, each_way, memory_of, remembered
 S = 10**9
 T0 = 1_784_000_000
 BEGIN = T0 * S
+DAY = 86_400 * S
 
 
 SOUND = "no loss or fault was found"
@@ -265,6 +266,19 @@ def test_what_stays_of_deleted_bags_has_no_rate_and_does_not_slow_the_growth_of_
     snapshot, latching = memory.index.snapshot(), memory.limits.latching
     rates = {topic: usual_rate(snapshot, topic, latching) for topic in ("/odom", "/bumper")}
     assert rates == {"/odom": 1.0, "/bumper": None}
+
+
+def test_bags_that_a_wrong_clock_dated_ahead_are_no_growth_of_the_newest_day(
+    tmp_path: Path,
+) -> None:
+    limits = QuerySettings(kept=RetentionLimits(10**6, 7 * 86_400 * S))
+    grown = []
+    for name, more in (("rec", along_x(BEGIN, 60)), ("ahead", along_x(BEGIN + 400 * DAY, 600))):
+        write_splits(tmp_path / name, more)
+        beat(tmp_path, BEGIN + 60 * S)
+        memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S), limits=limits)
+        grown.append(shown(memory)["budget"]["growth_gb_per_day"])
+    assert grown[0] == grown[1] > 0
 
 
 @each_way
