@@ -7,7 +7,7 @@ things that are carried about all the time: it has a track, and no places.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -15,12 +15,22 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.sights import SLICE_NS, Spot, Unplaced
-from ros2_memory.core.arrays import Columns, Flags, Groups, Ints, begins_of, in_ranges, narrowed
+from ros2_memory.core.arrays import (
+    Columns,
+    Flags,
+    Groups,
+    Ints,
+    begins_of,
+    in_ranges,
+    narrowed,
+    range_numbers,
+    run_starts,
+)
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.things.places import visits_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.core.model import TimeWindow, Vector3
@@ -105,22 +115,50 @@ class Move(NamedTuple):
     before: PlacedStay
     after: PlacedStay
 
-    def may_be_of(self, other: Instance) -> bool:
-        """Returns whether another thing may have come to the new place, or from the old one.
 
-        That is one which was first seen after the move began, or left its place before it ended. It
-        also left if nobody looked, where the same is true of the thing that moved.
+class _StayColumns(NamedTuple):
+    """The stays of the things of one label, thing by thing, and where each thing went from them.
+
+    Attributes:
+        begins: where the stays of each thing begin.
+        first, last: log times of the detections (ns).
+        left: whether it was seen to be gone.
+        next_first: when the thing was first seen after it; `MAX_NS` for the last stay.
+        is_moved: whether that is elsewhere, or not known.
+    """
+
+    begins: Ints
+    first: Ints
+    last: Ints
+    left: Flags
+    next_first: Ints
+    is_moved: Flags
+
+    @classmethod
+    def of(cls, things: Sequence[Instance]) -> _StayColumns:
+        """Returns the stays of one or more things."""
+        rows = [
+            (stay.first, stay.last, stay.left is not None)
+            + ((MAX_NS, True) if after is None else (after.first, after.place != stay.place))
+            for thing in things
+            for stay, after in zip_longest(thing.stays, thing.stays[1:])
+        ]
+        first, last, left, next_first, is_moved = np.array(rows, np.int64).T
+        begins = run_starts(range_numbers([len(thing.stays) for thing in things]))
+        return cls(begins, first, last, left > 0, next_first, is_moved > 0)
+
+    def may_have_moved(self, move: Move) -> Flags:
+        """Returns which things may have come to the new place of another one, or from the old one.
+
+        Those are the ones first seen after the move began, or that left their place before it
+        ended. They also left if nobody looked, where the same is true of the thing that moved.
         """
-        if other.stays[0].first > self.before.last:
-            return True
-        is_seen = self.before.left is not None
-        return any(
-            stay.last <= self.after.first
-            and not (is_seen and stay.left is None)
-            and (following is None or following.first >= self.after.first)
-            and (following is None or following.place != stay.place)
-            for stay, following in zip_longest(other.stays, other.stays[1:])
-        )
+        end = move.after.first
+        has_left = (self.last <= end) & (self.next_first >= end) & self.is_moved
+        if move.before.left is not None:
+            has_left &= self.left
+        is_new = self.first[self.begins] > move.before.last
+        return is_new | np.logical_or.reduceat(has_left, self.begins)
 
 
 @dataclass(slots=True)
@@ -234,15 +272,18 @@ class Estimate:
         inside = (first < window.stop) & (last >= window.start) & (last < before)
         return rows[inside & (self.counts[rows] > 0)]
 
-    def look_alikes(self, move: Move) -> int:
-        """Returns how many other things of one label may be the one that moved; see `may_be_of`."""
-        thing = move.thing
-        return sum(
-            other is not thing
-            and (other.key, other.epoch) == (thing.key, thing.epoch)
-            and move.may_be_of(other)
-            for other in self.instances
-        )
+    def look_alikes(self, moves: Iterable[Move]) -> Iterator[tuple[Move, int]]:
+        """Yields moves, each with how many other things of the label may be the one that moved."""
+        things_of: defaultdict[tuple[str, int], list[Instance]] = defaultdict(list)
+        for thing in self.instances:
+            things_of[thing.key, thing.epoch].append(thing)
+        stays_of: dict[tuple[str, int], _StayColumns] = {}
+        for move in moves:
+            kind = move.thing.key, move.thing.epoch
+            if kind not in stays_of:
+                stays_of[kind] = _StayColumns.of(things_of[kind])
+            is_other = np.array([thing is not move.thing for thing in things_of[kind]])
+            yield move, int(np.count_nonzero(is_other & stays_of[kind].may_have_moved(move)))
 
     def is_vague(self, rows: Ints) -> bool:
         """Returns whether the newest of the spots was seen while localisation was poor."""

@@ -490,8 +490,7 @@ def scatter_notes(stays: Iterable[tuple[Instance, PlacedStay]]) -> Iterator[str]
 def look_alike_notes(known: KnownThings, moves: Iterable[Move]) -> Iterator[str]:
     """Yields the labels of moves that may be of other things, and of how many."""
     most: dict[str, int] = {}
-    for move in moves:
-        others = known.estimate.look_alikes(move)
+    for move, others in known.estimate.look_alikes(moves):
         if others:
             most[move.thing.label] = max(others, most.get(move.thing.label, 0))
     if most:
