@@ -259,11 +259,9 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     note_other_frames(view, things, where)
     epochs = [instance.epoch for instance in things.estimate.instances]
     frame = things.frames[epochs[0] if epochs else 0]
-    if not (first.is_recorded and second.is_recorded):
-        view.notes.add("things are not compared: there is nothing to compare them with")
-        return frame, ComparedThings()
-    if earlier.start == later.start:
-        view.notes.add("things are not compared: the two times begin together")
+    why_not = _why_incomparable(first, second)
+    if why_not:
+        view.notes.add(f"things are not compared: {why_not}")
         return frame, ComparedThings()
     if later.stop < earlier.stop:
         view.notes.add(
@@ -276,18 +274,31 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    windows = earlier, later
+    places = places_asked(limits, where, things.frames)
+    return frame, _compared_with_notes(view, _ThingsBetween(things, earlier, later, where, places))
+
+
+def _why_incomparable(first: _Side, second: _Side) -> str:
+    """Returns why the things of two windows cannot be compared; empty if they can."""
+    if not (first.is_recorded and second.is_recorded):
+        return "there is nothing to compare them with"
+    if first.window.start == second.window.start:
+        return "the two times begin together"
+    return ""
+
+
+def _compared_with_notes(view: View, between: _ThingsBetween) -> ComparedThings:
+    """Returns what became of things, and notes what that does not say."""
+    things, windows = between.known, (between.earlier, between.later)
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, windows))
     view.notes.add(*crowded_notes(things))
-    places = places_asked(limits, where, things.frames)
-    between = _ThingsBetween(things, earlier, later, where, places)
     compared, moves = between.compare()
     view.notes.add(*look_alike_notes(things, moves), *shift_notes(moves, compared.same))
     view.notes.add(*scatter_notes(between.scattered(compared)))
     missed = {thing.label for thing in compared.not_seen_where_expected}
     instances = (thing for thing in things.estimate.instances if thing.label in missed)
     view.notes.add(*renamed_notes(things, islice(instances, _MOST_SCATTERED)))
-    return frame, compared
+    return compared
 
 
 def _are_of_one_run(sides: tuple[_Side, _Side]) -> bool:

@@ -217,7 +217,7 @@ class _FoundThing(NamedTuple):
         label: the name to show; `keys` are the keys of all its names.
         last: when it was last seen in the window.
         place: where it was then (m, in the frame of its epoch).
-        at_once: how many were seen there at once; None for one.
+        at_once: how many were seen there at once; None for one that stays somewhere.
         rows: its spots in the window; `newest` are its spots at `place`.
         stays: its stays in the window, in groups of consecutive stays at one place; none of people
             and pets.

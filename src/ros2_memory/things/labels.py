@@ -85,7 +85,7 @@ _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 
 def plain(label: str) -> str:
-    """Returns a label in lower case with single spaces; accents are decomposed."""
+    """Returns a label without case, with single spaces and accents in one form."""
     return caseless(_SPACING.sub(" ", label).strip())
 
 
