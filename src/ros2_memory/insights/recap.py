@@ -15,7 +15,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
 from ros2_memory.analysis.goals import FAILURES
-from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval, united_tables
+from ros2_memory.analysis.intervals import (
+    SILENCE_NS,
+    IntervalTable,
+    VisibleInterval,
+    united_tables,
+)
 from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
@@ -37,6 +42,7 @@ from ros2_memory.history.coverage import (
     unexcluded,
 )
 from ros2_memory.history.held_values import breaks_of, deletions, is_latched
+from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
@@ -394,17 +400,33 @@ def _reported_events(
     for topic, topic_events in events_of_topics.items():
         toggles = _toggles(view, topic, topic_events)
         if toggles:
+            mixed = _mixed_times(view, topic, window)
+            toggles = [one for one in toggles if not any(at.contains(one.time) for at in mixed)]
             # What is received as the recorder begins became so before.
             is_held = is_latched(view, topic)
             firsts = firsts_of_runs(view, topic, window) if is_held else frozenset()
             begun = _true_since_first_message(view, topic, topic_events)
-            flips = _flip_events(topic, toggles, _ends_of_holding(view, topic, window), begun)
+            ends = sorted([*_ends_of_holding(view, topic, window), *(at.start for at in mixed)])
+            flips = _flip_events(topic, toggles, ends, begun)
             events += (flip for flip in flips if flip.start not in firsts)
         errors = _errors_in_region(view, topic, topic_events, region_stays)
         events += [_error_event(error) for error in errors]
         events += _low_charge_events(view, topic, topic_events)
         note_limits(view, topic, topic_events)
     return events
+
+
+def _mixed_times(view: View, topic: str, window: TimeWindow) -> list[TimeWindow]:
+    """Returns when messages of two times, or robots, alternate on a topic; a note names each.
+
+    The next message after that may say something else, which is no change, either.
+    """
+    mixed = []
+    for pair in parallel_or_twice(view, topic, window):
+        how = pair.describe_by_clock(topic)
+        view.notes.add(f"{how}: no on/off changes of {topic} are listed there")
+        mixed.append(replace(pair.span, stop=min(pair.span.stop, MAX_NS - SILENCE_NS) + SILENCE_NS))
+    return mixed
 
 
 def _ends_of_holding(view: View, topic: str, window: TimeWindow) -> list[Ns]:

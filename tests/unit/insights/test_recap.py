@@ -134,6 +134,28 @@ def test_a_battery_without_a_known_charge_is_not_low(tmp_path: Path) -> None:
     assert over(remembered(tmp_path, told), 0, 59).events == ()
 
 
+@pytest.mark.parametrize("recordings", [1, 2])
+@each_way
+def test_a_boolean_toggles_not_at_each_message_of_a_time_that_is_recorded_twice(
+    tmp_path: Path, recalls: bool, recordings: int
+) -> None:
+    """It toggles every 50 s; after 300 s the clock is set back by 60, perhaps by a restart."""
+    for split in range(20):
+        messages = []
+        for second in range(30 * split, 30 * split + 30):
+            at = BEGIN + (second - 60 * (second >= 300)) * S
+            messages += [odom(at, 0.2 * second), boolean(at + 1, (second // 50) % 2 == 0)]
+        number = split * recordings // 20
+        write_mcap(tmp_path / f"rec{number}" / f"rec{number}_{split}.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    told = asked(memory, "recap", start=BEGIN / S, end=BEGIN / S + 600)
+    flips = [event for event in told["events"] if "became" in event["text"]]
+    since = [round(flip["timestamp"] - BEGIN / S) for flip in flips]
+    assert since == [50, 100, 150, 200, 340, 390, 440, 490]
+    assert flips[3]["duration_s"] == pytest.approx(40, abs=1.1)
+    assert any("set back" in note and "no on/off changes" in note for note in told["notes"])
+
+
 def test_one_pose_that_noise_throws_off_cuts_nothing_off_a_stop(tmp_path: Path) -> None:
     draw = Random(1)
     thrown = {5 * 50 + 25, 13 * 50 - 25}
