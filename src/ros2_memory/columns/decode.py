@@ -90,6 +90,8 @@ _HELD_BYTES: Final = LARGE_BYTES
 LARGEST_MESSAGE_BYTES: Final = LARGE_BYTES
 """A topic has no columns in a bag once a message of it is larger."""
 _NOT_ASKED: Final = "only times were asked for"
+_UNDECODABLE: Final = "some cannot be decoded"
+"""Without the error, which differs from bag to bag: parts are joined by this reason."""
 _DECODED_BYTES: Final = 1 << 20
 """Payloads whose decoded messages are in memory at once."""
 _EVERYTHING: Final = TimeWindow.everything()
@@ -419,8 +421,8 @@ class Group:
         try:
             pieces = _one_by_one(self.reader, kind.plan, batch, table, skip=self.skip_undecodable)
             return [join_tables([*pieces])]
-        except UndecodableError as error:
-            return [table.without_columns(f"some cannot be decoded: {error.reason}")]
+        except UndecodableError:
+            return [table.without_columns(_UNDECODABLE)]
 
 
 def _pieces_of(batch: Batch) -> Iterator[Batch]:

@@ -67,6 +67,19 @@ def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty
     check_all(world)
 
 
+def test_bags_of_which_messages_are_torn_in_different_places_have_one_topic_and_parts_together(
+    tmp_path: Path,
+) -> None:
+    """A week of them would have a topic and parts for each bag, which every question looks at."""
+    for number in range(4):
+        said = [text(T0 + (number * 60 + n) * S, "word") for n in range(3)]
+        torn = replace(said[-1], body=said[-1].payload[: 5 + number])
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [*said, torn])
+    world = World.of(tmp_path)
+    assert world.fill() == 4
+    assert (count(tmp_path, "topic"), count(tmp_path, "part")) == (1, 1)
+
+
 @pytest.mark.parametrize("others", [[], [10**6]])
 def test_bags_have_parts_together_also_beside_one_of_a_clock_that_was_ahead(
     tmp_path: Path, others: list[int]
