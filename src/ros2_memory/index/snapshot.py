@@ -52,7 +52,7 @@ from ros2_memory.index.split_order import Neighbours, is_recording, neighbours, 
 from ros2_memory.index.timeline import MAX_FILE_NS, Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.index.bag_rows import Bags
@@ -248,6 +248,7 @@ class Snapshot:
         """Where no correctly dated bag has a message for a while, in order of time."""
         pauses: list[Pause] = []
         newest: BagFile | None = None
+        misdated = self.dating.misdated
         for segment in self._dated_segments:
             if newest is None:
                 pauses += segment.pauses
@@ -262,7 +263,7 @@ class Snapshot:
                     if pause.end - reach > SHORTEST_PAUSE_NS
                 )
             for pause in segment.pauses_within:
-                pauses += self._parts_shared_by_all(pause)
+                pauses += self._parts_shared_by_all(pause, misdated)
             if newest is None or segment.latest > newest.end:
                 newest = segment.newest
         # One that ends where a clock was set ahead begins before the memory.
@@ -270,11 +271,11 @@ class Snapshot:
         dated = (pause for pause in pauses if pause.start >= begin)
         return sorted(dated, key=lambda pause: pause.span)
 
-    def _parts_shared_by_all(self, pause: Pause) -> Iterator[Pause]:
-        """Yields the parts of a bag's pause in which no other bag has a message either."""
+    def _parts_shared_by_all(self, pause: Pause, misdated: Collection[str]) -> Iterator[Pause]:
+        """Yields the parts of a bag's pause in which no other dated bag has a message either."""
         others: list[Span] = []
         for bag in self.timeline.overlapping(TimeWindow(pause.start + 1, pause.end)):
-            is_counted = not is_carried(bag.file) and bag.file not in self.dating.misdated
+            is_counted = not is_carried(bag.file) and bag.file not in misdated
             if is_counted and bag not in pause.bags:
                 others += without([(bag.start, bag.end)], bag.summary.schema.pauses)
         parts = [
