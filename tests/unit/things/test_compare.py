@@ -113,6 +113,28 @@ def test_things_that_all_went_the_same_way_may_stand_on_a_map_that_shifted(tmp_p
     assert notes("each its own", stood, pushed) == []
 
 
+@pytest.mark.parametrize("frame", ["utm", "earth"])
+def test_a_map_that_was_laid_out_anew_between_two_days_is_said_to_be(
+    tmp_path: Path, frame: str
+) -> None:
+    """As by robot_localization, whose map begins where the robot was switched on."""
+
+    def day(name: str, begin: int, utm_x: float) -> None:
+        at = (BEGIN + begin) * S
+        anchor = tf(at, transform(at, "map", frame, (utm_x, -5.32e6, 0.0)), topic="/tf_static")
+        seen = [anchor, *looked(begin, begin + 30, HERE, MUG, BOOK)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", seen)
+
+    day("monday", 0, -455_000.0)
+    day("tuesday", 60, -455_012.4)
+    note = f"{frame} is 12.40 m elsewhere in map than before"
+    assert note in str(ask(tmp_path, "compare", **EARLIER, **LATER)["notes"])
+    day("wednesday", 120, -455_012.4)
+    later = {"start": BEGIN + 120, "end": BEGIN + 149}
+    same = ask(tmp_path, "compare", with_start=BEGIN + 60, with_end=BEGIN + 89, **later)
+    assert "elsewhere" not in str(same.get("notes"))
+
+
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
     stood = looked(0, 30, HERE, BOOK, in_map=False)
     later = looked(60, 90, (3.0, 0.0, 0.0), BOOK, in_map=False)
