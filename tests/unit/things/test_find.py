@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -17,6 +17,7 @@ import pytest
 
 from ros2_memory.analysis import sights
 from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.sights import JoinedSights
 from ros2_memory.core.arrays import rows_by
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Place, Rectangle
@@ -24,11 +25,10 @@ from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.base import Record
-from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import estimation, known, places, synonyms, unseen
 from ros2_memory.things.find import find_things
+from ros2_memory.things.instances import Estimate
 from ros2_memory.things.places import places_of
 from tests.support.bags import (
     Msg,
@@ -1183,28 +1183,23 @@ def labels_and_notes(memory: Memory) -> tuple[set[str], list[str]]:
     return {each.label for each in found.things}, notes
 
 
-class WithoutEstimates(ByteLru[tuple[Timeline, object]]):
-    """Keeps only how many sightings can be compared in time."""
-
-    def put(self, key: Hashable, value: tuple[Timeline, object], size: int) -> None:
-        if not isinstance(value[1], known.KnownThings):
-            super().put(key, value, size)
-
-
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crowded = eight_bags(tmp_path)
-    scanner = crowded.scanner
-    assert scanner is not None
-    caches = replace(scanner.caches, things=WithoutEstimates(1 << 20))
-    monkeypatch.setattr(scanner, "caches", caches)
     monkeypatch.setattr(known, "_FEWER", 100)
-    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
-    labels_and_notes(crowded)
     monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
-    compared = [len(labels_and_notes(crowded)[0]) for _ in range(5)]
-    assert compared == [1, 2, 4, 8, 8]
+    with monkeypatch.context() as slow:
+
+        def of_one(seen: JoinedSights, *others: Any) -> Estimate:
+            if len(seen.spots) > 1:
+                raise known._TakesTooLongError
+            return estimation.estimate(seen, *others)
+
+        slow.setattr(known, "estimate", of_one)
+        assert len(labels_and_notes(crowded)[0]) == 1
+    compared = [len(labels_and_notes(crowded)[0]) for _ in range(4)]
+    assert compared == [2, 4, 8, 8]
 
 
 def test_of_a_window_before_what_was_compared_no_never_is_said(
