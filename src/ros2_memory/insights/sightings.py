@@ -67,6 +67,7 @@ if TYPE_CHECKING:
 
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
+_NUMBERS: Final = ("std_msgs/msg/Int", "std_msgs/msg/UInt", "std_msgs/msg/Float")
 _LEFT_TO_SAY_S: Final = 2.0
 """The part of the call's time that a search leaves for reading the messages of matches."""
 
@@ -190,8 +191,9 @@ def _select_rows(
     search = ReverseSearch(view, pattern, condition)
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_latched_notes(view, search, scope.window))
-    if selected.rows:
-        view.notes.add(*_notes_on_texts(view, topics))
+    sightings = (row for row in selected.rows if isinstance(row, Sighting))
+    of_moments = {row.topic for row in sightings if row.first == row.until}
+    view.notes.add(*_notes_on_moments(view, sorted(of_moments)))
     return selected
 
 
@@ -351,8 +353,9 @@ def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope)
             f"more than {MOST_COUNTED:,} episodes" if is_full else "",
         )
     spans = _run_spans(view, ReverseSearch(view, pattern, condition), scope)
-    if spans.spans.size:
-        view.notes.add(*_notes_on_texts(view, topics))
+    first, last, _ = spans.spans.T
+    if (first == last).any():
+        view.notes.add(*_notes_on_moments(view, topics))
     return spans
 
 
@@ -422,12 +425,15 @@ def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> Stor
     return held if for_type.matches(view.value(held)) else None
 
 
-def _notes_on_texts(view: View, topics: Sequence[str]) -> Iterator[str]:
-    """Yields a note if rare texts, as of a mission's states, count as long as their messages."""
+def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
+    """Yields a note if rare texts or numbers, as of states, count as long as their messages."""
     for topic in topics:
-        if _is_said_once(view, topic):
+        what = "text" if is_text(view, topic) else "number"
+        types = view.timeline.types_of(topic)
+        is_plain = what == "text" or all(name.startswith(_NUMBERS) for name in types)
+        if is_plain and not is_latched(view, topic) and holds_on(view, [topic]):
             yield (
-                f"a text on {topic} counts for the moment in which it was said: changes, and by "
+                f"a {what} on {topic} counts for the moment in which it was said: changes, and by "
                 "value, of get_topic_in_range have for how long each held until the next one"
             )
 

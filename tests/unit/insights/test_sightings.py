@@ -680,6 +680,24 @@ def test_a_state_without_an_empty_text_holds_until_the_next_one(
 
 
 @each_way
+def test_a_rare_number_is_said_to_count_for_its_moment_alone(tmp_path: Path, recalls: bool) -> None:
+    """A row of a field each 75 s; a level every second says how long it was below a limit."""
+    type_name = "std_msgs/msg/Int32"
+    rows = [
+        Msg("/row", type_name, BEGIN + 75 * nth * S, make(type_name, data=nth)) for nth in range(4)
+    ]
+    levels = [
+        Msg("/level", type_name, BEGIN + at * S, make(type_name, data=at)) for at in range(300)
+    ]
+    memory = remembered(tmp_path, in_order([*rows, *levels]), recalls=recalls)
+    for given in ({}, {"by": "hour"}):
+        row = {"topic": "/row", "condition_type": "equals", "field": "data", "value": 2, **given}
+        assert "a number on /row counts for the moment" in str(asked(memory, "find_matches", **row))
+        level = {**row, "topic": "/level", "condition_type": "below", "value": 20}
+        assert "counts for the moment" not in str(asked(memory, "find_matches", **level))
+
+
+@each_way
 def test_where_the_robot_was_is_known_long_after_a_topic_spoke(
     tmp_path: Path, recalls: bool
 ) -> None:
