@@ -611,9 +611,10 @@ def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> st
     angles = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
     meant = f" (did you mean {angles[0]}?)" if angles else ""
     texts = [name for name in names if looks_like_json(_text(getattr(message, name, None)))]
-    in_text = (
-        f"; {texts[0]} is a text of JSON: a condition may be on {texts[0]}.{path}" if texts else ""
-    )
+    in_text = ""
+    if texts:
+        key = path.removeprefix(f"{texts[0]}.")
+        in_text = f"; {texts[0]} is a text of JSON: a condition may be on {texts[0]}.{key}"
     return (
         f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {fields}{in_text}"
