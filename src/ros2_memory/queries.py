@@ -287,7 +287,7 @@ def topic_range(
     if not read.samples:
         undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(read.undecodable)))
         raise with_notes(view, window, undecodable)
-    _note_samples(view, read, total)
+    _note_samples(view, read)
     note_unread(view, window, gaps=read.picked < total)
     note_edges(view, window)
     note_robots(view, name, window)
@@ -327,15 +327,13 @@ class _Samples:
     picked: int = 0
 
 
-def _note_samples(view: View, read: _Samples, total: int) -> None:
+def _note_samples(view: View, read: _Samples) -> None:
     """Notes what samples leave out of all messages of a window."""
     view.notes.add(*read.notes)
     for why, count in read.undecodable.items():
         view.notes.add(f"{count} samples left out: {why}")
     if len(read.types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(read.types)}")
-    if read.picked < total:
-        view.notes.add(f"{read.picked} of {total} samples, evenly spaced over the window")
     if read.unnamed:
         view.notes.add(f"{read.unnamed} samples left out: they say nothing of the fields")
 
@@ -911,13 +909,6 @@ def _drawn(
 def _path_notes(path: Trajectory, plausible_mps: float) -> Iterator[str]:
     """Yields what a path leaves out, and how it was measured."""
     yield from length_notes(path)
-    jumps = [point for point in path.waypoints if point.jump]
-    # Waypoints also mark where odometry restarted: that is no jump of the robot.
-    if jumps and path.totals.jumps:
-        longest = "the longest lead" if len(jumps) < path.totals.jumps else "each leads"
-        yield (
-            f"of the jumps {longest} to a waypoint with jump: true; that distance was not driven"
-        )
     mean, fastest = path.avg_speed, path.max_speed
     is_stated = path.max_speed_from == "twist"
     if path.totals.jumps and is_stated and fastest is not None and fastest > plausible_mps:

@@ -366,18 +366,13 @@ def length_notes(path: Trajectory) -> Iterator[str]:
     if path.invalid:
         poses = counted(path.invalid, "pose")
         yield f"{poses} left out: their coordinates are not valid (NaN, all zeros or out of range)"
-    if path.is_noisy:
-        # Without numbers, so that several windows share one note; the reply has them.
-        yield (
-            "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
-        )
     if path.avg_speed is None and path.poses:
         within = "" if path.poses == 1 else f" within {totals.duration_s:.3f} s"
         yield f"{counted(path.poses, 'pose')}{within}: too short to say how fast"
     if totals.is_uncertain:
         yield (
-            "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "
-            "of the steps: distance_m may be too long, because noise cannot be removed"
+            "distance_m may be too long by noise or sharp turns: the positions are more than "
+            "0.25 s apart"
         )
     if totals.gaps:
         without = "without a valid pose" if path.invalid else "without a pose"
