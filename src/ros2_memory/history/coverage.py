@@ -216,20 +216,14 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each way in which messages of a window were lost."""
     losses = read_losses(bag_dir, window.start, window.stop)
     yield from _count_losses(losses, _LOST, window)
-    refused = defaultdict[str, Spans](list)
-    for loss in losses:
-        if loss.by == "refused":
-            refused[loss.topic].append((loss.start, loss.stop - 1))
-    topics = sorted(refused)
-    for topic in topics[:MAX_NAMED]:
-        spans = [span_text(*span) for span in united(refused[topic], _EDGE_NS)]
+    refused = [loss for loss in losses if loss.by == "refused"]
+    if refused:
+        first, last = min(loss.start for loss in refused), max(loss.stop for loss in refused) - 1
+        topics = sorted({loss.topic for loss in refused})
         yield (
-            f"messages of a publisher of {topic} were not recorded from "
-            f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS or type did not fit the "
-            "subscription: how many is not known"
+            f"messages of {listed(topics)} are missing from {span_text(first, last)}, as the QoS "
+            "or type of a publisher did not fit the subscription: how many is not known"
         )
-    if others := topics[MAX_NAMED:]:
-        yield f"for the same reason messages were not recorded of publishers of {listed(others)}"
 
 
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
@@ -550,8 +544,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
         names.setdefault(shortened(remark), []).append(short_name(bag.path))
     shown = [*names.items()][:most]
     for remark, files in reversed(shown):
-        subject = f"{len(files)} bags ({listed(files)})" if len(files) > 1 else files[0]
-        yield f"{subject}: {remark}"
+        yield f"{listed(files)}: {remark}"
     more = len(bags) - sum(len(files) for _, files in shown)
     if more:
         yield f"{counted(more, 'older bag is', 'older bags are')} odd too"

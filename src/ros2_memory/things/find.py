@@ -115,8 +115,9 @@ def find_things(
             # What was sought near it may well be a thing: nothing was looked for.
             wanted = {known.labels.key(nearness.label): nearness.label}
     note_unread(view, asked_window, nothing=not found, gaps=not found)
-    if not found and searched != asked_window:
-        view.notes.add(describe_misdated(view.snapshot.misdated))
+    misdated = view.snapshot.misdated
+    if not found and searched != asked_window and misdated:
+        view.notes.add(describe_misdated(misdated))
     question = ThingsQuestion(
         labels=wanted,
         found=frozenset(key for thing in found for key in thing.keys),

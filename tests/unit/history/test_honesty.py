@@ -369,7 +369,7 @@ def test_an_index_that_no_message_needs_is_no_doubt_of_an_answer(tmp_path: Path)
     never = {"condition_type": "contains", "value": "x"}
     assert asked(memory, "find_last_match", topic="/bumper", **never) is None
     [named] = asked(memory, "data_time_range")["notes"]
-    assert named.startswith("3 bags (c/c_0.db3, b/b_0.db3, a/a_0.db3): its index by time")
+    assert named.startswith("c/c_0.db3, b/b_0.db3, a/a_0.db3: its index by time")
 
 
 DAY = 24 * 3600 * S
