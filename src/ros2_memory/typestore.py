@@ -214,8 +214,8 @@ class Typestores:
         missing = f"its part {name} (in {trail[-1]})" if trail else "it"
         kind = "action" if "/action/" in name else "msg"
         raise _UnusableError(
-            f"{missing} has no definition in the bag, in the configured folders or among the"
-            f" standard types; put the package's .{kind} folder into reader.custom_msg_paths"
+            f"{missing} has no definition in the bag or elsewhere; put the package's .{kind} folder"
+            " into reader.custom_msg_paths"
         )
 
 

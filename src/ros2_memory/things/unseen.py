@@ -76,7 +76,7 @@ _MOST_TYPES: Final = 3
 """The constants of this many types are looked up: each reads the channels of a file."""
 _ARTICLE: Final = re.compile(r"^(?:an?|the) ")
 _UNDECODED: Final = Reason(
-    "could not be decoded, so detections in them are not known", "topic", of="messages of "
+    "could not be decoded, so their detections are unknown", "topic", of="messages of "
 )
 
 
