@@ -260,9 +260,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterato
         longest = max(spans, key=lambda span: span[1] - span[0])
         times = f"from {span_text(*longest)}"
         if len(spans) > 1:
-            lengths = (min(end, window.stop) - max(start, window.start) for start, end in spans)
-            all_of_it = seconds(sum(lengths))
-            times = f"{len(spans)} times ({all_of_it}), the longest {times}"
+            times = f"{len(spans)} times, the longest {times}"
         because = f", because {INTERRUPTIONS[cause]}" if cause else ""
         yield f"nothing {what} {times}{because}"
 
