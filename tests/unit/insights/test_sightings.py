@@ -163,7 +163,7 @@ def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: 
     assert found is not None
     assert found.frame_id == "odom"
     elsewhere = queries.find_last_match(memory, Call(), near({"x": 6.0, "y": 2.0}))
-    assert "in the frame of each message: odom" in elsewhere.notes[-1]
+    assert "within 0.5 m in odom" in elsewhere.notes[-1]
     there: JsonValue = {"x": 6.0, "y": 2.0, "frame_id": "map"}
     for ask in (
         lambda: find_matches(memory, Call(), near(there)),

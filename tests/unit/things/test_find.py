@@ -247,7 +247,7 @@ def test_things_of_two_runs_of_odometry_are_not_said_to_be_near_each_other(tmp_p
         write_splits(tmp_path / str(run), [*chain.from_iterable(messages)])
     found = ask(tmp_path, label="cup")
     assert found["total"] == 2
-    assert "each run of odometry has its own coordinates" in str(found["notes"])
+    assert "may be listed once for each run of odometry" in str(found["notes"])
     assert "may be one thing" not in str(found["notes"])
 
 
@@ -921,8 +921,8 @@ def test_in_the_dark_nothing_is_missed(tmp_path: Path, later: list[Seen]) -> Non
     assert found.keys() == {"crate", "cup", "kettle", "pot", "tray"}
     assert not any("moved_times" in thing for thing in found.values())
     assert not any("not_seen_where_expected" in thing["still_there"] for thing in found.values())
-    [blind] = [note for note in reply["notes"] if "detected nothing" in note]
-    assert blind.startswith(f"/vision/scene/scene_objects detected nothing from {BEGIN + 70}")
+    [blind] = [note for note in reply["notes"] if "was blind" in note]
+    assert blind.startswith(f"/vision/scene/scene_objects was blind from {BEGIN + 70}")
     windows = {"with_start": BEGIN, "with_end": BEGIN + 59, "start": BEGIN + 70, "end": BEGIN + 600}
     compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows)
     assert "not_seen_where_expected" not in compared["things"]
