@@ -67,6 +67,8 @@ if TYPE_CHECKING:
 
 WHEREABOUTS: Final = "where the robot was"
 """What notes say is not known without poses."""
+_NEAR_NS: Final = 60 * NS_PER_S
+"""Transforms that lead to a place so long before or after make it unknown, and not nowhere."""
 NEWEST_POSE_NS: Final = SILENCE_NS
 """After so long without a pose the robot may have moved."""
 _OLD_NS: Final = NS_PER_S
@@ -257,22 +259,25 @@ def placed_waypoints(
 def _placed_waypoint(
     view: View, topic: str, waypoint: Waypoint, own_frame: str, frame_id: str
 ) -> Waypoint | None:
-    """Returns a waypoint in another frame, by the transforms of its time or up to `HOLD_NS` off.
-
-    None if none of these leads there.
-    """
+    """Returns a waypoint in another frame by `_pose_held_in`; None if no transform leads there."""
     recording = recording_at(view, topic, waypoint.time)
     if recording is None:
         return None
     # A quaternion of the yaw about z; of NaN without one, so that the transform places the rest.
     half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
     pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-    for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
-        in_frame = pose_in(view, pose, frame_id, waypoint.time + off, recording)
-        if in_frame is not None and in_frame.orientation is not None:
-            turn = None if waypoint.yaw_rad is None else yaw(in_frame.orientation)
-            return replace(waypoint, position=in_frame.position, yaw_rad=turn)
-    return None
+    in_frame = _pose_held_in(view, pose, frame_id, waypoint.time, recording)
+    if in_frame is None or in_frame.orientation is None:
+        return None
+    turn = None if waypoint.yaw_rad is None else yaw(in_frame.orientation)
+    return replace(waypoint, position=in_frame.position, yaw_rad=turn)
+
+
+def _pose_held_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
+    """Returns `pose_in` by the transforms of a time, or up to `HOLD_NS` off, as for tracks."""
+    offs = (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS)
+    tried = (pose_in(view, pose, frame_id, time + off, recording) for off in offs)
+    return next((in_frame for in_frame in tried if in_frame is not None), None)
 
 
 def _require_transform(
@@ -293,19 +298,20 @@ def _require_transform(
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
     """Returns a pose with the names of the places that it is in, whatever their frames.
 
-    A note names a frame of places that transforms lead to at another time alone.
+    A note names a frame of places that transforms lead to within a minute, but not then.
     """
-    places = view.limits.places
-    frames = {place.frame_id for place in places}
-    pose_of_frame = {frame: pose_in(view, pose, frame, time, recording) for frame in frames}
+    places, near = view.limits.places, TimeWindow.around(time, _NEAR_NS)
     inside: list[Place] = []
-    for place in places:
-        in_frame = pose_of_frame[place.frame_id]
-        if in_frame is not None and contains(place.region, *in_frame.position):
-            inside.append(place)
-    for frame, in_frame in pose_of_frame.items():
-        if in_frame is None and pose.frame_id and connects(view, (frame, pose.frame_id)):
-            view.notes.add(f"in which place is not known: no transform leads to {frame} then")
+    for frame in dict.fromkeys(place.frame_id for place in places):
+        frames = frame, pose.frame_id
+        in_frame = pose_in(view, pose, frame, time, recording)
+        if in_frame is None and pose.frame_id and connects_in_time(view, frames, near):
+            in_frame = _pose_held_in(view, pose, frame, time, recording)
+            if in_frame is None:
+                view.notes.add(f"in which place is not known: no transform leads to {frame} then")
+        if in_frame is not None:
+            of_frame = (place for place in places if place.frame_id == frame)
+            inside += (place for place in of_frame if contains(place.region, *in_frame.position))
     return replace(pose, places=names_by_size(inside))
 
 
