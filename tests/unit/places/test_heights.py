@@ -20,6 +20,7 @@ from tests.support.storeys import (
     BEGIN,
     END,
     HOUSE,
+    ROOM,
     TIMES,
     UP_M,
     WAY,
@@ -130,6 +131,13 @@ def test_transforms_to_the_map_have_heights(
     for second, name in ((20, "kitchen"), (100, "bedroom")):
         assert asked(memory, "get_position_at", timestamp=BEGIN + second)["in"] == name
     assert asked(memory, "recap", where="bedroom", **span)["inside_s"] == pytest.approx(62, abs=1)
+
+
+def test_a_robot_whose_map_goes_on_a_storey_above_did_not_pass_the_landing(tmp_path: Path) -> None:
+    messages = [odom(at, z=UP_M if nth >= 150 else 0.0) for nth, at in enumerate(TIMES[:300])]
+    memory = with_places(remembered(tmp_path, messages), {"landing": Storey(ROOM, 0.5, 2.0)})
+    reply = asked(memory, "recap", where="landing", start=BEGIN, end=BEGIN + 60)
+    assert (reply["visits"], reply["inside_s"]) == (0, 0)
 
 
 @settings(max_examples=examples(25))

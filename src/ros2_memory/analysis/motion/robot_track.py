@@ -309,8 +309,8 @@ def _vertices(part: PartialTrack, keeps: Flags, recordings: Ints) -> NDArray[np.
 
 def jumps(track: RobotTrack) -> Flags:
     """Returns after which vertices the robot jumped to the next one, faster than plausible."""
-    lasted = np.diff(track.times)
-    far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > track.fastest_mps * lasted
+    lasted, x, y, z = map(np.diff, (track.times, track.x, track.y, track.z))
+    far = np.fmax(np.hypot(x, y), np.abs(z)) * 1e9 > track.fastest_mps * lasted
     jumped = far & (lasted > 0) & (lasted <= _JUMP_NS) & ~track.begins[1:]
     return np.append(jumped, [False])[: len(track.times)]
 
