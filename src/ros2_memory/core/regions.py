@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -291,15 +291,17 @@ class Place:
     region: Region
 
 
-def places_at(places: Sequence[Place], frame_id: str, point: Vector3) -> tuple[str, ...]:
-    """Returns the names of the places of a frame that a point is in, the smallest first."""
-    of_frame = (place for place in places if place.frame_id == frame_id)
-    return names_by_size(place for place in of_frame if contains(place.region, *point))
+def places_at(places: Sequence[Place], points: Mapping[str, Vector3 | None]) -> tuple[str, ...]:
+    """Returns the names of the places that a point is in, the smallest first.
 
-
-def names_by_size(places: Iterable[Place]) -> tuple[str, ...]:
-    """Returns the names of places, the smallest first."""
-    return tuple(place.name for place in sorted(places, key=lambda place: _area(place.region)))
+    `points` has it in each frame in which it is known.
+    """
+    inside = (
+        place
+        for place in places
+        if (point := points.get(place.frame_id)) is not None and contains(place.region, *point)
+    )
+    return tuple(place.name for place in sorted(inside, key=lambda place: _area(place.region)))
 
 
 def plan_of(region: Region) -> Region:

@@ -590,7 +590,7 @@ def _compare_standstills(
         spans = (stop.span for stop in side.drive.standstills)
         stands.append([*placed_standstills(track, spans, region)])
     stood = (
-        at._replace(inside=places_at(places, frame, at.place))
+        at._replace(inside=places_at(places, {frame: at.place}))
         for at in _standstill_differences(stood_at(*stands))
     )
     return frame, tuple(stood)

@@ -259,7 +259,7 @@ def farthest_from(
     pose = _farthest_pose(TrackReader(view, frame), track, spans, (x, y))
     if pose is None:
         return None
-    inside = places_at(view.limits.places, frame, pose.place)
+    inside = places_at(view.limits.places, {frame: pose.place})
     return FarthestPose((x, y), frame, pose.away_m, pose.time, pose.place, inside)
 
 

@@ -31,7 +31,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import Place, contains, names_by_size
+from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.spans import Spans, spans_of, without
 from ros2_memory.core.text import Reason, abbreviate, counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, Waypoint
     from ros2_memory.core.arrays import Flags
+    from ros2_memory.core.model import Vector3
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -300,19 +301,18 @@ def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
 
     A note names a frame of places that transforms lead to within a minute, but not then.
     """
-    places, near = view.limits.places, TimeWindow.around(time, _NEAR_NS)
-    inside: list[Place] = []
-    for frame in dict.fromkeys(place.frame_id for place in places):
-        frames = frame, pose.frame_id
+    points: dict[str, Vector3] = {}
+    near = TimeWindow.around(time, _NEAR_NS)
+    for frame in dict.fromkeys(place.frame_id for place in view.limits.places):
         in_frame = pose_in(view, pose, frame, time, recording)
+        frames = frame, pose.frame_id
         if in_frame is None and pose.frame_id and connects_in_time(view, frames, near):
             in_frame = _pose_held_in(view, pose, frame, time, recording)
             if in_frame is None:
                 view.notes.add(f"in which place is not known: no transform leads to {frame} then")
         if in_frame is not None:
-            of_frame = (place for place in places if place.frame_id == frame)
-            inside += (place for place in of_frame if contains(place.region, *in_frame.position))
-    return replace(pose, places=names_by_size(inside))
+            points[frame] = in_frame.position
+    return replace(pose, places=places_at(view.limits.places, points))
 
 
 @dataclass(frozen=True, slots=True)
@@ -567,13 +567,14 @@ class RobotPlaces:
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the names of the places that the robot was in, the smallest place first."""
-        inside: list[Place] = []
-        for place in self.view.limits.places:
-            if place.frame_id in self.placement.frames:
-                point = place_at(self._track_in(place.frame_id), time, SILENCE_NS)
-                if point is not None and contains(place.region, *point):
-                    inside.append(place)
-        return names_by_size(inside)
+        places = self.view.limits.places
+        frames = dict.fromkeys(place.frame_id for place in places)
+        points = {
+            frame: place_at(self._track_in(frame), time, SILENCE_NS)
+            for frame in frames
+            if frame in self.placement.frames
+        }
+        return places_at(places, points)
 
     @cached_property
     def _jumps(self) -> Flags:

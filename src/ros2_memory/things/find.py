@@ -494,7 +494,7 @@ class _Finder:
         if usual is None:
             return None
         return tuple(
-            replace(place, inside=places_at(self.places, frame, place.place)) for place in usual
+            replace(place, inside=places_at(self.places, {frame: place.place})) for place in usual
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:

@@ -117,7 +117,7 @@ class KnownThings:
             end=int(spots[:, Spot.LAST].max()),
             place=place,
             count=int(self.estimate.counts[rows].sum()),
-            inside=places_at(places, frame, place),
+            inside=places_at(places, {frame: place}),
         )
 
 

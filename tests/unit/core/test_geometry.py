@@ -205,4 +205,4 @@ def test_of_places_within_each_other_the_smallest_is_named() -> None:
     bends = Polygon(tuple((x * 1.5, y * 1.5) for x, y in HORSESHOE.corners))
     for region in (Circle(1, 1, 0.5), bends, Circle(2.6, 2.6, 2.7)):
         places = (kitchen, Place("part", "map", region), Place("yard", "odom", region))
-        assert places_at(places, "map", (1.0, 1.0, 0.0)) == ("part", "kitchen")
+        assert places_at(places, {"map": (1.0, 1.0, 0.0)}) == ("part", "kitchen")
