@@ -232,6 +232,7 @@ class MemoryDays:
             BagError: a day cannot be read or written.
             OSError: the folder cannot be read, or a day cannot be deleted.
         """
+        self._delete_unfinished()
         self.clear()
         if not self.keeps:
             return
@@ -283,6 +284,12 @@ class MemoryDays:
         if left != thinned:
             THINNED.write(self.bag_dir, left)
 
+    def _delete_unfinished(self) -> None:
+        """Deletes the new files of days that a kill left; nothing else writes there now."""
+        if not self._folder.is_symlink():
+            for path in self._folder.glob(".*.thinned.mcap.*"):
+                path.unlink(missing_ok=True)
+
     def _delete_day(self, path: Path) -> None:
         path.unlink()
         _log.warning("memory_day_deleted", path=str(path))
@@ -324,8 +331,7 @@ class MemoryDays:
             return
         if self._count_down(len(days)):
             return
-        unfinished = self._folder.glob(".*.thinned.mcap.*")
-        for path in [*unfinished, *days, self.bag_dir / THINNED_FILE]:
+        for path in [*days, self.bag_dir / THINNED_FILE]:
             path.unlink(missing_ok=True)
         _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         with suppress(OSError):

@@ -201,6 +201,14 @@ def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> 
     assert McapReader().summarize(bag_dir / DAY_FILE).complete
 
 
+def test_what_a_kill_left_unfinished_of_a_day_goes_with_the_next_pass(bag_dir: Path) -> None:
+    left = bag_dir / "memory/.20260801.thinned.mcap.repair"
+    left.parent.mkdir()
+    left.write_bytes(b"half of it")
+    house(bag_dir, T0 + 3600 * S, max_age_h=24, memory=days_of(bag_dir)).apply()
+    assert not left.exists()
+
+
 def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir: Path) -> None:
     split(bag_dir, 0)
     keep_all(bag_dir)
