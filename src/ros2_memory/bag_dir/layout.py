@@ -79,7 +79,7 @@ EXPIRED_FILE: Final = f"{OWN_FOLDER}/expired.json"
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""
 TIMED_FILES: Final = frozenset(
-    {LOST_FILE, DELETED_FILE, EXPIRED_FILE, SCREENED_FILE, TRIGGERS_FILE}
+    {LOST_FILE, DELETED_FILE, EXPIRED_FILE, ERASING_FILE, SCREENED_FILE, TRIGGERS_FILE}
 )
 """State by log times: it would apply to the next simulation, which has the same times."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE, THINNED_NAME})

@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import SCREENED_FILE, TIMED_FILES
+from ros2_memory.bag_dir.state_files import ERASING, Erasure
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from tests.support.screened_bags import ScreenedBags, off, on, words
 
@@ -97,6 +99,13 @@ def test_what_is_known_by_log_times_stays_where_a_recording_is_left(
     clear_bags(tmp_path)
     is_left = [(tmp_path / name).exists() for name in sorted(TIMED_FILES)]
     assert is_left == [folder != "rec_1"] * len(TIMED_FILES)
+
+
+def test_an_interrupted_erasure_takes_nothing_from_the_next_simulation(tmp_path: Path) -> None:
+    make(tmp_path, "rec_1/rec_1_0.mcap")
+    ERASING.write(tmp_path, Erasure.of(["/speech"], [TimeWindow(0, 10**9)], ()))
+    clear_bags(tmp_path)
+    assert ERASING.read(tmp_path) is None
 
 
 def test_the_root_homes_what_holds_them_and_a_link_to_one_are_refused(tmp_path: Path) -> None:
