@@ -8,8 +8,10 @@ of one another. What did not change is not looked at again, since a week has 60,
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum, auto
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
@@ -135,6 +137,16 @@ _LEFT_OPEN: Final = frozenset({FileState.INCOMPLETE, FileState.HELD_BACK})
 back may, too, else a disk too full to cut them would stay full."""
 
 
+class _Fate(Enum):
+    """What becomes of a bag: who deletes it, and what counts it."""
+
+    MAY_GO = auto()
+    STAYS = auto()
+    SAVED = auto()  # a file of a moment: moments are counted by themselves
+    FOREIGN = auto()
+    IGNORED = auto()  # it stays, and counts nowhere
+
+
 class _Folder(NamedTuple):
     """A recording's directory: its device, and the bytes that go with its last bag."""
 
@@ -176,44 +188,50 @@ class Inventory:
             OSError: the bag directory or the list of the recorder's own recordings cannot be read.
         """
         self._drop_other_device()
-        bags: list[StoredBag] = []
-        other_bytes = state_bytes = state_bytes_in(self.root)
-        foreign_bytes, saved = 0, self._saved_sizes(known)
-        recordings: set[str] = set()
         judge = None
         if self.own is not None:
             self.own.names()  # reads the list anew, or fails
             judge = cache(self.own.judge_of)
+        saved = self._saved_sizes(known)
+        bags: list[StoredBag] = []
+        recordings: set[str] = set()
+        sizes = Counter[_Fate]()
         for state, bag in chain(self._changing(known), self._settled(known)):
-            path, recording = bag.path, bag.recording
-            if path in deleted:
+            if bag.path in deleted:
                 continue
-            folder, _, name = path.rpartition("/")
-            is_named = recording in known.named
+            folder, _, name = bag.path.rpartition("/")
             is_own = judge is None or judge(folder)(name)
-            is_saved = path in known.tree.saved
-            # A split is listed moments after it appears.
-            is_new = is_named and split_number(recording, name) is not None
-            if not (is_own or is_saved or is_new):
-                foreign_bytes += sum(file.size for file in bag.files)
-                continue
-            recordings.add(recording)
-            if is_saved:
-                continue  # moments are counted by themselves
-            may_go = is_own and _may_be_deleted(state, path, is_named=is_named)
-            if may_go and path not in remaining:
+            fate = self._fate_of(bag, state, known, is_own=is_own)
+            if fate is _Fate.MAY_GO and bag.path not in remaining:
                 bags.append(bag)
-            elif self._counts(state, bag):
-                other_bytes += sum(file.size for file in bag.files if file.inode not in saved)
-        other_bytes += sum(self._folder_of(name, known.now).size for name in recordings)
+            else:
+                sizes[fate] += sum(file.size for file in bag.files if file.inode not in saved)
+            if fate is not _Fate.FOREIGN:
+                recordings.add(bag.recording)
+        beside = sum(self._folder_of(name, known.now).size for name in recordings)
+        state_bytes = state_bytes_in(self.root)
         return DirContents(
             bags,
             known.now,
-            other_bytes,
+            state_bytes + beside + sizes[_Fate.MAY_GO] + sizes[_Fate.STAYS],
             saved=saved,
-            foreign_bytes=foreign_bytes,
+            foreign_bytes=sizes[_Fate.FOREIGN],
             state_bytes=state_bytes,
         )
+
+    def _fate_of(
+        self, bag: StoredBag, state: FileState, known: KnownBags, *, is_own: bool
+    ) -> _Fate:
+        if bag.path in known.tree.saved:
+            return _Fate.SAVED
+        is_named = bag.recording in known.named
+        # A split is listed moments after it appears.
+        is_new = is_named and split_number(bag.recording, bag.path.rpartition("/")[2]) is not None
+        if not is_own and not is_new:
+            return _Fate.FOREIGN
+        if is_own and _may_be_deleted(state, bag.path, is_named=is_named):
+            return _Fate.MAY_GO
+        return _Fate.STAYS if self._counts(state, bag) else _Fate.IGNORED
 
     def _drop_other_device(self) -> None:
         """Forgets bags and folders if the disk came back under another device number."""
