@@ -386,13 +386,12 @@ class Thinned:
 
     def without(self, spans: Spans, topics: Collection[str] | None = None) -> Thinned:
         """Returns what is not in spans of log time; of some topics only their silences go."""
-        left = self._where(lambda first, last: not overlaps_any(spans, first, last))
         if topics is None:
-            return left
+            return self._where(lambda first, last: not overlaps_any(spans, first, last))
         silences = (
             silence
             for silence in self.silences
-            if silence in left.silences or silence[0] not in topics
+            if silence[0] not in topics or not overlaps_any(spans, *silence[1:3])
         )
         return replace(self, silences=tuple(silences))
 
