@@ -47,6 +47,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import COMPRESSED, UNMARKED_KINDS, TimeWindow
+from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.file_state import reason_unread
@@ -248,7 +249,7 @@ class Eraser:
 
     def _report_losses(self, erasure: Erasure) -> None:
         """Has answers report the messages as lost; an earlier attempt may have done so."""
-        known = read_losses(self.bag_dir, MIN_NS, MAX_NS)
+        known = {*read_losses(self.bag_dir, MIN_NS, MAX_NS)}
         losses = (
             Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
             for gone in erasure.counts
@@ -407,11 +408,7 @@ def _may_have_messages(summary: BagSummary, topic: str, erasure: Erasure) -> boo
     totals = summary.of(topic)
     if topic in erasure.latched:
         return bool(totals)
-    return any(
-        start <= total.last and total.first < stop
-        for total in totals
-        for start, stop in erasure.windows
-    )
+    return any(overlaps_any(erasure.windows, total.first, total.last) for total in totals)
 
 
 def _without_messages(message_list: MessageList, file: str, ids: Ids) -> MessageList:
