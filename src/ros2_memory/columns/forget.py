@@ -19,6 +19,7 @@ from ros2_memory.columns.database import PRAGMAS, is_busy
 from ros2_memory.columns.pack import FORMAT
 from ros2_memory.columns.writing import UNUSED_SUMMARIES, delete_bags
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.spans import overlaps_any, united
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -92,10 +93,11 @@ def _delete_bags_and_unused(
         base.execute(f"PRAGMA {pragma}")
     base.execute("BEGIN IMMEDIATE")  # closing the connection rolls back
     stored = base.execute("SELECT path, first_ns, last_ns FROM bag").fetchall()
+    spans = united((time.start, time.stop) for time in times)
     gone = [
         path
         for path, first, last in stored
-        if any(time.overlaps(first, last) for time in times) or not (bag_dir / path).exists()
+        if overlaps_any(spans, first, last) or not (bag_dir / path).exists()
     ]
     delete_bags(base, [*bags, *gone])
     # Deleting these may leave another part that lacks a bag of its ten minutes.

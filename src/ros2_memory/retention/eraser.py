@@ -232,8 +232,10 @@ class Eraser:
 
     def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
         """Returns an erasure with the files that have its messages, and how many these are."""
-        windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
-        counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
+        windows = Counter[_Window]()
+        for holder in survey.holders:
+            windows.update(holder.windows)
+        counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()) if count)
         paths = chain.from_iterable(holder.paths for holder in survey.holders)
         return replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
 
