@@ -115,16 +115,30 @@ class Robot:
             detail = "; ".join((error.detail, *self._lake_report(call).notes))
             raise NoDataError(error.reason, detail, error.notes) from error
         except (RefusedError, LakeError) as failure:
-            lacks_payloads = isinstance(failure, NotInLakeError)
-            if self.own is None or not (lacks_payloads or _reaches_back(self.own, since)):
-                raise
-            try:
-                return ask(self.own, call), None
-            except NoDataError as error:
-                if lacks_payloads:
-                    raise failure from None
-                notes = (*error.notes, f"the lake has no answer either: {failure}")
-                raise NoDataError(error.reason, error.detail, notes) from failure
+            return self._ask_own(ask, call, since, failure), None
+
+    def _ask_own(
+        self,
+        ask: Callable[[Memory, Call], T],
+        call: Call,
+        since: Callable[[Ns], Ns | None],
+        failure: EpisodicError,
+    ) -> T:
+        """Returns what `ask` finds in the robot's own bags, where the lake has no answer.
+
+        Raises:
+            EpisodicError: `failure`, if these bags do not answer either.
+        """
+        lacks_payloads = isinstance(failure, NotInLakeError)
+        if self.own is None or not (lacks_payloads or _reaches_back(self.own, since)):
+            raise failure
+        try:
+            return ask(self.own, call)
+        except NoDataError as error:
+            if lacks_payloads:
+                raise failure from None
+            notes = (*error.notes, f"the lake has no answer either: {failure}")
+            raise NoDataError(error.reason, error.detail, notes) from failure
 
     def _lake_report(self, call: Call) -> LakeReport:
         own = None if self.own is None else self.own.index.published
