@@ -12,6 +12,7 @@ known:
 from __future__ import annotations
 
 import json
+import math
 from bisect import bisect_left, bisect_right
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -399,10 +400,15 @@ def deletions(view: View, topic: str) -> Sequence[Ns]:
 
 
 def _canonical(value: JsonValue) -> JsonValue:
-    """Returns a value in the one form of all equal values: 2 for 2.0, and 0 for -0.0."""
+    """Returns a value in the one form of all that replies show alike: 2 for 2.0, 0 for -0.0.
+
+    And 0.3 for 0.1 + 0.2, which is another float.
+    """
     if isinstance(value, dict):
         return {name: _canonical(part) for name, part in value.items()}
-    return int(value) if isinstance(value, float) and value.is_integer() else value
+    if not isinstance(value, float) or not math.isfinite(value):
+        return value
+    return int(value) if value.is_integer() else round_real(value)
 
 
 def is_latched(view: View, topic: str) -> bool:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -428,6 +429,24 @@ def tags(at: int, *numbers: int) -> Msg:
 def cups(at: int, *numbers: int) -> Msg:
     things = [("cup" if each == 7 else "pot", 0.9, (1.0, 0.0, 0.0)) for each in numbers]
     return detected(at, things, topic="/detections")
+
+
+def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
+    """0.1 + 0.2 is another float than 0.3: 0.3 had two rows, and changed to 0.3."""
+    kind, shown = "std_msgs/msg/Float64", [0.3, 0.1 + 0.2, 0.3, 0.5]
+    said = [Msg("/limit", kind, (T + at) * S, make(kind, data=shown[at % 4])) for at in range(9)]
+    ask = partial(asked, remembered(tmp_path, said), "get_topic_in_range", topic="/limit")
+    window = {"start": T, "end": T + 8}
+    rows = ask(by="value", **window)["rows"]
+    assert [row[:3] for row in rows] == [["0.3", 3, 6.0], ["0.5", 2, 2.0]]
+    changes = ask(changes=True, **window)["changes"]
+    assert [(change["value"], change["seconds"]) for change in changes] == [
+        (0.3, 3.0),
+        (0.5, 1.0),
+        (0.3, 3.0),
+        (0.5, 1.0),
+        (0.3, 0.0),
+    ]
 
 
 @each_way
