@@ -470,13 +470,10 @@ def _numbers_by_type(channels: Iterable[_Messages], topic: str) -> dict[str, _Nu
     parts = [np.concatenate(messages.parts, 1) for messages in of_topic]
     times, places, _ = np.concatenate(parts, 1)
     order = np.lexsort((places, times))
-    channel_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])[order]
-    numbers: dict[str, _Numbers] = {}
-    for kind in {messages.channel.type for messages in of_topic}:
-        own = [nth for nth, messages in enumerate(of_topic) if messages.channel.type == kind]
-        at = np.flatnonzero(np.isin(channel_of, own))
-        numbers[kind] = _Numbers(times[order][at], at)
-    return numbers
+    types = [messages.channel.type for messages in of_topic]
+    type_of = np.repeat(types, [part.shape[1] for part in parts])[order]
+    at = {kind: np.flatnonzero(type_of == kind) for kind in types}
+    return {kind: _Numbers(times[order][numbers], numbers) for kind, numbers in at.items()}
 
 
 def _channel_rows(channels: Sequence[_Messages]) -> Iterator[Row]:
