@@ -37,6 +37,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ros2_memory.core.arrays import Flags, Floats, Vectors, row_maxima, row_sums, runs_where
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ros2_memory.core.model import Vector3
 
 FEWEST: Final = 16
@@ -187,30 +189,45 @@ def measure(seconds: Floats, positions: Vectors) -> Measured:
     varies[0] = True
     points = points[:, varies]
     plain = np.sqrt(row_sums(np.diff(points, axis=0) ** 2))
-    total = float(plain.sum())
     apart = np.diff(seconds)
     if len(points) < FEWEST:
-        speed_mps = _sparse_speed(plain, apart)
+        total, speed_mps = float(plain.sum()), _sparse_speed(plain, apart)
         ends = [End(step, 0.0, plain=True, creep=None) for step in plain.tolist() or [0.0]]
         return Measured(total, total, ends[0], ends[-1], False, speed_mps, plain)
     noise = _noise(points)
     places = _moving_mean(points, _MEAN_SPAN)
-    lengths, as_plain, stationary = _steps(points, plain, noise)
+    steps = _steps(points, plain, noise)
     if np.median(apart) > _DENSE_S:
-        stationary &= _scatters(points, places, noise)
-        lengths, as_plain = plain, ~stationary
+        stationary = steps.stationary & _scatters(points, places, noise)
+        steps = _StepLengths(plain, ~stationary, stationary)
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
-    # Creeps replace the steps in them. Those at the ends are counted once the path is joined.
+    creeps = {
+        (begin, end): _creep(places[begin : end + 1], reach[begin : end + 1], positions[0], varies)
+        for begin, end in runs_where(steps.stationary).tolist()
+        if end - begin >= min(_STATIONARY_STEPS, len(plain))
+    }
+    return _measured(seconds, plain, steps, noise, creeps)
+
+
+def _measured(
+    seconds: Floats,
+    plain: Floats,
+    without_noise: _StepLengths,
+    noise: Vectors,
+    creeps: Mapping[tuple[int, int], Creep],
+) -> Measured:
+    """Returns the measurements of a path whose steps in a creep count as that.
+
+    `creeps` have the first step of each, and the one after its last.
+    """
+    lengths, as_plain, _ = without_noise
     moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
     first_creep = last_creep = None
-    for begin, end in runs_where(stationary).tolist():
-        if end - begin < min(_STATIONARY_STEPS, len(plain)):
-            continue
-        run = slice(begin, end + 1)
-        creep = _creep(places[run], reach[run], positions[0], varies)
+    for (begin, end), creep in creeps.items():
         moved[begin:end] = 0.0
         steps[begin:end] = creep.length_m / (end - begin)
+        # Those at the ends are counted once the path is joined.
         if begin == 0:
             first_creep = creep
         if end == len(plain):
@@ -218,6 +235,7 @@ def measure(seconds: Floats, positions: Vectors) -> Measured:
         if begin > 0 and end < len(plain):
             inside_m += creep.length_m
     spread = np.sqrt(row_sums(noise**2))
+    total = float(plain.sum())
     return Measured(
         total if as_plain.all() else float(moved.sum()) + inside_m,
         total,
