@@ -6,7 +6,6 @@ See `insights.sightings`. A match while the scope does not hold counts as no mat
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -43,6 +42,7 @@ class Run(NamedTuple):
             topic one of `breaks_of`); `MAX_NS` if that is unknown.
         later: how many matches after the last one have the same log time.
         begun: 1 if it is known what came before the first match, else 0.
+        node: the number of the node that publishes diagnostics; else 0.
     """
 
     topic: str
@@ -52,6 +52,7 @@ class Run(NamedTuple):
     until: Ns
     later: int
     begun: int
+    node: int
 
 
 _FIRST, _LAST, _MESSAGES, _BEGUN = 1, 2, 3, 6
@@ -89,13 +90,15 @@ class _NodeRuns:
 
     Args:
         topic: its number.
+        node: its number.
         apart: whether each match is a run of its own.
         breaks: of a latched topic: the moments, in order, through which no value holds. On another
             topic (None) none holds through a silence.
     """
 
-    def __init__(self, topic: int, *, apart: bool, breaks: Ints | None) -> None:
+    def __init__(self, topic: int, node: int, *, apart: bool, breaks: Ints | None) -> None:
         self._topic = topic
+        self._node = node
         self._apart = apart
         self._breaks = breaks
         self._tables: list[Ints] = []
@@ -130,8 +133,8 @@ class _NodeRuns:
         until = np.append(times[bounds], MAX_NS)[next_bound[stops - 1]]
         lasts = times[rows[stops - 1]]
         later = np.searchsorted(times[rows], lasts, side="right") - stops
-        columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later, 1)
-        runs = np.stack(np.broadcast_arrays(self._topic, *columns), axis=1)[::-1]
+        columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later)
+        runs = np.stack(np.broadcast_arrays(self._topic, *columns, 1, self._node), axis=1)[::-1]
         if goes_on and next_bound[-1:].tolist() == [bounds.size]:
             # The newest of these runs is the begin of the oldest one before.
             oldest = self._tables[-1][-1]
@@ -166,8 +169,8 @@ class _TopicRuns:
 
     def __init__(self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None) -> None:
         times = None if breaks is None else np.array(breaks, np.int64)
-        new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times)
-        self._by_node: dict[int, _NodeRuns] = defaultdict(new_runs)
+        self._new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times)
+        self._by_node: dict[int, _NodeRuns] = {}
         self._waiting: list[Tested] = []
         self._messages = 0
         # Blocks without a match that follow the next older one before a silence, the newest first.
@@ -205,6 +208,8 @@ class _TopicRuns:
         tested = stacked(self._waiting[::-1])
         self._waiting, self._messages = [], 0
         for node in np.unique(tested.nodes).tolist():
+            if node not in self._by_node:
+                self._by_node[node] = self._new_runs(node)
             self._by_node[node].add(rows_of(tested, tested.nodes == node))
 
     def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:

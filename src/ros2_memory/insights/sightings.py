@@ -37,7 +37,7 @@ from ros2_memory.history.held_values import (
     note_unnamed,
 )
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
@@ -369,9 +369,11 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     is_log = np.array([*map(view.timeline.is_log, topics)], np.bool_)
     states = np.flatnonzero(~is_log[searched_runs.table[:, 0]])
     known = 0
+    oldest: dict[tuple[str, int], tuple[int, Run]] = {}
     try:
         for known, run in zip(states.tolist(), searched_runs.runs(states), strict=True):
             lasts[known] = _lasted_until(view, run, scope)
+            oldest[run.topic, run.node] = known, run
     except QueryTimeoutError:
         # The runs of several topics overlap: since when all are known cannot be said.
         if not known or len(topics) > 1:
@@ -380,10 +382,8 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
         return SightingSpans(spans[:known], int(firsts[known - 1]))
     if searched_runs.is_over:
         return SightingSpans(spans, int(firsts[-1]))
-    for nth, topic in enumerate(topics):
-        own = np.flatnonzero(searched_runs.table[:, 0] == nth)
-        if own.size and not (is_log[nth] or scope.is_bounded):
-            are_begun[own[-1]] = not _matched_before(view, search, topic, int(firsts[own[-1]]))
+    for row, run in () if scope.is_bounded else oldest.values():
+        are_begun[row] = not _matched_before(view, search, run)
     start, end = scope.window.asked()
     earlier = [
         (first, last, False)
@@ -394,14 +394,18 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     return SightingSpans(np.concatenate((spans, held_spans(earlier))))
 
 
-def _matched_before(view: View, search: ReverseSearch, topic: str, first: Ns) -> bool:
+def _matched_before(view: View, search: ReverseSearch, run: Run) -> bool:
     """Returns whether a run of matches goes on from a match before what was searched."""
-    before = held_at(view, topic, first)
-    if before is None and not is_latched(view, topic):
-        before = view.stream.last(topic, first)
-        if before is not None and first - before.time > SILENCE_NS:
-            return False
-    return before is not None and bool(search.matches(before))
+    if is_latched(view, run.topic):
+        held = held_at(view, run.topic, run.first)
+        return held is not None and bool(search.matches(held))
+    near = TimeWindow(max(run.first - SILENCE_NS, MIN_NS), run.first)
+    for block in search.blocks(run.topic, near):
+        tested = block.tested()
+        met = tested.met[(tested.nodes == run.node) & (tested.met != UNKNOWN)]
+        if met.size:
+            return bool(met[-1] == MET)
+    return False
 
 
 def _goal_spans(view: View, goal: GoalRun, scope: Scope) -> Iterator[tuple[Ns, Ns, bool]]:

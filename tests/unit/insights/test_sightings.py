@@ -379,6 +379,30 @@ def test_a_pose_of_seconds_before_is_said_to_be_old_unless_poses_are_rare(
 
 
 @each_way
+def test_what_several_nodes_reported_since_before_a_window_does_not_begin_in_it(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """The camera's error goes on, too, which the lidar's message parts from its own before."""
+    messages = []
+    for second in range(200):
+        at = BEGIN + second * S
+        messages.append(diagnostics(at, lidar=(2, "no data")))
+        messages.append(diagnostics(at + 1000, camera=(2, "no data")))
+        messages.append(diagnostics(at + 2000, motor=(2, "no data") if second > 150 else (0, "")))
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    counted = asked(
+        memory,
+        "find_matches",
+        topic="/diagnostics",
+        condition_type="contains",
+        value="no data",
+        start=BEGIN / S + 100,
+        by="day",
+    )
+    assert dict(zip(counted["columns"][1:], counted["all"], strict=True))["count"] == 1
+
+
+@each_way
 @pytest.mark.parametrize("split_s", [7.0, 1000.0])
 def test_diagnostics_of_one_node_go_on_while_others_report(
     tmp_path: Path, split_s: float, *, recalls: bool
