@@ -495,11 +495,16 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
         return last
     _, end = scope.window.asked()
     may_hold = is_latched(view, run.topic) or (is_flag and holds_on(view, [run.topic]))
-    if run.until == MAX_NS or may_hold:
+    until = run.until
+    if may_hold or (until == MAX_NS and scope.is_bounded):
         until = held_until(view, run.topic, last, end, or_rare=is_flag)
-        return scope.holds_until(last, until)
-    is_silent = run.until - last > SILENCE_NS
-    return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
+    elif until == MAX_NS:
+        # What follows in the window, if anything, is of other nodes of diagnostics.
+        beyond = TimeWindow(max(last + 1, scope.window.stop), last + SILENCE_NS + 1)
+        following = None if beyond.empty else view.stream.first([run.topic], beyond)
+        until = last if following is None else following.time
+    is_silent = until - last > SILENCE_NS and not may_hold
+    return scope.holds_until(last, last if is_silent else max(last, min(until, end)))
 
 
 def _is_ended(view: View, run: Run, until: Ns) -> bool:

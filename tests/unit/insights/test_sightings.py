@@ -403,6 +403,21 @@ def test_what_several_nodes_reported_since_before_a_window_does_not_begin_in_it(
 
 
 @each_way
+def test_no_message_of_another_node_ends_the_state_of_one_that_died(
+    tmp_path: Path, recalls: bool
+) -> None:
+    messages = []
+    for second in range(200):
+        at = BEGIN + second * S
+        messages += [diagnostics(at, lidar=(2, "no data"))] * (second <= 100)
+        messages.append(diagnostics(at + 1000, camera=(0, "")))
+    memory = remembered(tmp_path, messages, recalls=recalls)
+    condition = {"condition_type": "contains", "value": "no data"}
+    [died] = asked(memory, "find_matches", topic="/diagnostics", **condition)["sightings"]
+    assert (died["duration_s"], died["ended"]) == (100, False)
+
+
+@each_way
 @pytest.mark.parametrize("split_s", [7.0, 1000.0])
 def test_diagnostics_of_one_node_go_on_while_others_report(
     tmp_path: Path, split_s: float, *, recalls: bool
