@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -48,8 +47,8 @@ def without(spans: Iterable[Span], others: Sequence[Span]) -> Spans:
     parts: Spans = []
     for start, stop in spans:
         at = start
-        first = bisect_right(others, start, key=itemgetter(1))
-        for other_start, other_stop in islice(others, first, None):
+        for nth in range(bisect_right(others, start, key=itemgetter(1)), len(others)):
+            other_start, other_stop = others[nth]
             if other_start >= stop:
                 break
             if other_start > at:

@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, 
 from ros2_memory.core.arrays import run_starts
 from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import enclosing
+from ros2_memory.core.spans import Spans, enclosing, spans_of, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import FAR_AHEAD_NS, Pause, pauses_between
@@ -434,6 +434,15 @@ class Segment:
             for bag in self._bags_with("pauses")
             for start, end in bag.summary.schema.pauses
         )
+
+    @cached_property
+    def covered(self) -> Spans:
+        """When some bag may have messages: from its first one to its last, but for its pauses."""
+        is_whole = ~self.bags.with_schema(attrgetter("pauses"))
+        spans = spans_of(self.bags.starts[is_whole], self.bags.ends[is_whole])
+        for bag in self._bags_with("pauses"):
+            spans += without([(bag.start, bag.end)], bag.summary.schema.pauses)
+        return united(spans)
 
     @cached_property
     def silent(self) -> frozenset[str]:

@@ -34,7 +34,7 @@ from ros2_memory.analysis.silences import (
     silences,
     usual_periods,
 )
-from ros2_memory.bag_dir.layout import is_carried, named_start
+from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import Spans, united, without
@@ -52,7 +52,7 @@ from ros2_memory.index.split_order import Neighbours, is_recording, neighbours, 
 from ros2_memory.index.timeline import MAX_FILE_NS, Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.index.bag_rows import Bags
@@ -248,7 +248,6 @@ class Snapshot:
         """Where no correctly dated bag has a message for a while, in order of time."""
         pauses: list[Pause] = []
         newest: BagFile | None = None
-        misdated = self.dating.misdated
         for segment in self._dated_segments:
             if newest is None:
                 pauses += segment.pauses
@@ -263,7 +262,7 @@ class Snapshot:
                     if pause.end - reach > SHORTEST_PAUSE_NS
                 )
             for pause in segment.pauses_within:
-                pauses += self._parts_shared_by_all(pause, misdated)
+                pauses += self._parts_shared_by_all(pause)
             if newest is None or segment.latest > newest.end:
                 newest = segment.newest
         # One that ends where a clock was set ahead begins before the memory.
@@ -271,21 +270,21 @@ class Snapshot:
         dated = (pause for pause in pauses if pause.start >= begin)
         return sorted(dated, key=lambda pause: pause.span)
 
-    def _parts_shared_by_all(self, pause: Pause, misdated: Collection[str]) -> Iterator[Pause]:
+    def _parts_shared_by_all(self, pause: Pause) -> Iterator[Pause]:
         """Yields the parts of a bag's pause in which no other dated bag has a message either."""
-        others: list[Span] = []
-        for bag in self.timeline.overlapping(TimeWindow(pause.start + 1, pause.end)):
-            is_counted = not is_carried(bag.file) and bag.file not in misdated
-            if is_counted and bag not in pause.bags:
-                others += without([(bag.start, bag.end)], bag.summary.schema.pauses)
         parts = [
             (start, end)
-            for start, end in without([pause.span], united(others))
+            for start, end in without([pause.span], self._covered)
             if end - start > SHORTEST_PAUSE_NS
         ]
         for start, end in parts:
             # Another recording in the middle of the pause makes a step of the clock likely.
             yield pause._replace(start=start, end=end, ran_on=pause.ran_on and len(parts) == 1)
+
+    @cached_property
+    def _covered(self) -> Spans:
+        """When some correctly dated bag may have messages."""
+        return united(chain.from_iterable(segment.covered for segment in self._dated_segments))
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:
