@@ -21,6 +21,8 @@ from enum import StrEnum
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, set_back_while_written
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, TimeWindow
@@ -293,21 +295,21 @@ def _step_faults(
         if step.before.file not in faulty and step.after.file not in faulty
     ]
     within_bags = {fault.bag.file: fault for fault in faults if fault.before is None}
-    strays: set[str] = set()
+    starts, ends = timeline.starts, timeline.ends
+    are_strays = np.zeros(starts.size, np.bool_)
     for fault in faults:
         if not _is_shown_within_bag(fault, within_bags):
             yield fault
         if fault.before is None or fault.by < FAR_BACK_NS:
             continue
         sides = [
-            timeline.overlapping(TimeWindow.around(at, FAR_BACK_NS // 2))
+            TimeWindow.around(at, FAR_BACK_NS // 2).overlapping(starts, ends)
             for at in (fault.bag.start, fault.before.end)
         ]
         # Of equals the earlier one is wrong: a clock that loses its time falls back.
-        for bag in min(sides, key=len):
-            if bag.file not in strays and bag.file not in faulty:
-                strays.add(bag.file)
-                yield ClockFault(bag, FaultyClock.STRAY)
+        are_strays |= min(sides, key=np.count_nonzero)
+    strays = map(timeline.bags.__getitem__, np.flatnonzero(are_strays).tolist())
+    yield from (ClockFault(bag, FaultyClock.STRAY) for bag in strays if bag.file not in faulty)
 
 
 def _is_shown_within_bag(fault: ClockFault, within_bags: Mapping[str, ClockFault]) -> bool:
