@@ -16,7 +16,7 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice, zip_longest
@@ -374,7 +374,7 @@ class _ThingsBetween:
     places: Sequence[Place]
 
     def compare(self) -> tuple[ComparedThings, Sequence[Move]]:
-        """Returns what differs, each list with the things seen last first, and the moves."""
+        """Returns what differs, each list with the rarest labels first, and the moves."""
         lists: dict[_Kind, list[ComparedThing]] = defaultdict(list)
         not_looked_at: list[tuple[Instance, ComparedThing]] = []
         moves: list[Move] = []
@@ -398,7 +398,7 @@ class _ThingsBetween:
             else:
                 lists[kind].append(thing)
         lists["not_looked_at"], lists["not_comparable"] = _pair_across_runs(not_looked_at)
-        ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
+        ordered = {kind: _rarest_first(things) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers), moves
 
@@ -531,6 +531,15 @@ def _pair_across_runs(
     for candidates in later.values():
         alone += [thing for _, thing in candidates]
     return alone, pairs
+
+
+def _rarest_first(things: Sequence[ComparedThing]) -> tuple[ComparedThing, ...]:
+    """Returns things in the order of how many have their label; of equals those seen last first.
+
+    A reply has the first ones: a crate, and not five of a vineyard's grapes.
+    """
+    often = Counter(thing.label for thing in things)
+    return tuple(sorted(things, key=lambda thing: (often[thing.label], *_newest_first(thing))))
 
 
 def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:

@@ -113,6 +113,24 @@ def test_things_that_all_went_the_same_way_may_stand_on_a_map_that_shifted(tmp_p
     assert notes("each its own", stood, pushed) == []
 
 
+def test_the_one_crate_that_appeared_is_listed_beside_more_grapes_than_a_reply_has(
+    tmp_path: Path,
+) -> None:
+    grapes = [("grape", 2.0 + 0.8 * (nth % 4), 0.8 * (nth // 4)) for nth in range(12)]
+    crate = ("crate", 3.0, -1.0)
+    reply = compared(
+        tmp_path,
+        [
+            *looked(0, 30, HERE, MUG),
+            *looked(60, 75, HERE, MUG, *grapes, crate),
+            *looked(75, 90, HERE, MUG, *grapes),
+        ],
+    )
+    appeared = reply["things"]["appeared"]
+    assert [thing["label"] for thing in appeared] == ["crate", *["grape"] * 4]
+    assert reply["things"]["appeared_total"] == 13
+
+
 @pytest.mark.parametrize("frame", ["utm", "earth"])
 def test_a_map_that_was_laid_out_anew_between_two_days_is_said_to_be(
     tmp_path: Path, frame: str
