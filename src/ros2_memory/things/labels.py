@@ -76,10 +76,20 @@ _MOVES_BY_ITSELF: Final = frozenset(
         "dog",
         "cat",
         "pet",
+        "bird",
+        "boar",
+        "cattle",
+        "cow",
+        "deer",
+        "fox",
+        "goat",
+        "horse",
+        "sheep",
+        "wolf",
     }
 )
-_NO_ANIMALS: Final = frozenset({"hot dog", "corn dog"})
-"""Keys that end in a word for a pet, and name a thing."""
+_NO_ANIMALS: Final = frozenset({"hot dog", "corn dog", "rocking horse"})
+"""Keys that end in a word for an animal, and name a thing."""
 _NO_PLURALS: Final = ("ss", "us", "is")
 _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
@@ -106,7 +116,7 @@ def unspaced(key: str) -> str:
 
 
 def moves_by_itself(key: str) -> bool:
-    """Returns whether a key names people or pets."""
+    """Returns whether a key names people, pets, or animals of fields and woods."""
     return key not in _NO_ANIMALS and last_word(key) in _MOVES_BY_ITSELF
 
 

@@ -187,9 +187,17 @@ def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "moves"), [("dog", True), ("small dog", True), ("hot dog", False), ("dog bed", False)]
+    ("key", "moves"),
+    [
+        ("dog", True),
+        ("small dog", True),
+        ("roe deer", True),
+        ("hot dog", False),
+        ("dog bed", False),
+        ("rocking horse", False),
+    ],
 )
-def test_people_and_pets_move_by_themselves_and_food_does_not(key: str, *, moves: bool) -> None:
+def test_people_and_animals_move_by_themselves_and_food_does_not(key: str, *, moves: bool) -> None:
     assert moves_by_itself(key) == moves
 
 
