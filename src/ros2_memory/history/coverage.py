@@ -1,6 +1,6 @@
 """Coverage: notes in an answer on data of its window that could not be read.
 
-The first few of each kind are named, and the others counted:
+The newest of a kind is named, or the first few are, and the others counted:
 
 - files that were not read at all: damaged, or of a kind that is not read here. The times of such a
   file are estimated by its recording and its mtime (see `index.snapshot`), so that an old one is
@@ -9,8 +9,8 @@ The first few of each kind are named, and the others counted:
 - missing splits that a metadata.yaml lists, for searches and answers that there is nothing;
 - the file that is being written, from its last readable message on, or from the end of the split
   before it;
-- bags that a crash left open, up to their mtime;
-- closed bags that could not be read whole, or that contradict themselves;
+- bags that a crash left open, from their last message up to their mtime;
+- closed bags that may lack messages;
 - gaps, and times before the memory begins, in which retention deleted what was recorded;
 - messages that the recorder found to be missing (`bag_dir.state_files`);
 - intervals that `recording.exclude_when` excluded;
