@@ -105,8 +105,8 @@ class SummarySchema:
 
     @cached_property
     def faults(self) -> tuple[str, ...]:
-        """The remarks but for an early end."""
-        return tuple(remark for remark in self.remarks if not remark.startswith(ENDS_EARLY))
+        """The notes but for an early end."""
+        return tuple(note for note in self.notes if not note.startswith(ENDS_EARLY))
 
     @cached_property
     def is_damaged(self) -> bool:

@@ -344,7 +344,8 @@ class Timeline:
 def _span_of_faults(bag: BagFile) -> Span:
     if bag.state is not BagState.INCOMPLETE:
         return bag.start, bag.end
-    is_cut_off = bag.summary.remarks and not bag.summary.schema.faults
+    schema = bag.summary.schema
+    is_cut_off = schema.remarks and not schema.faults and schema.clock_set_back is None
     start = max(bag.end - OUT_OF_ORDER_NS, bag.start) if is_cut_off else bag.start
     return start, bag.mtime_ns if bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS else bag.end
 

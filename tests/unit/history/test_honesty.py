@@ -227,6 +227,24 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
 
 
+def test_a_clock_that_was_set_back_in_an_unfinished_bag_is_no_reason_why_messages_are_missing(
+    tmp_path: Path,
+) -> None:
+    ticks = [*range(30), *range(10, 40)]
+    path = write_mcap(
+        tmp_path / "rec" / "rec_0.mcap",
+        [boolean(T0 + n * S, True) for n in ticks],
+        McapLayout(chunk_size=300, finish=False),
+    )
+    os.utime(path, ns=(T0 + 45 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    window = {"topic": "/bumper", "start": at(0), "end": at(44)}
+    notes = asked(memory, "get_topic_in_range", **window)["notes"]
+    missing = [note for note in notes if "missing" in note]
+    assert missing == [f"messages after {at(34):.6f} may be missing, as a crash left 1 bag open"]
+    assert any("twice, as the clock was set back meanwhile" in note for note in notes)
+
+
 def write_protobuf(path: Path, topics: int) -> None:
     path.parent.mkdir(parents=True)
     with path.open("wb") as stream:
