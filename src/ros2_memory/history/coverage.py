@@ -136,7 +136,7 @@ def _describe_unread(
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         files = _newest([(aside.path, aside.reason) for aside in lost])
-        yield f"could not be read and may hold more: {files}"
+        yield f"could not be read, so messages may be missing: {files}"
     active = being_written(snapshot, window, nothing=nothing)
     # Splits are not served before they were searched.
     if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:

@@ -66,7 +66,7 @@ S = 10**9
 T0_S = 1_784_023_200
 T0 = T0_S * S
 HOUR = 3600 * S
-LOST = "could not be read and may hold more: rec/rec_1.mcap"
+LOST = "could not be read, so messages may be missing: rec/rec_1.mcap"
 
 
 def messages(start_s: int) -> list[Msg]:
@@ -277,7 +277,7 @@ def test_many_topics_that_are_not_read_hide_no_damaged_file(tmp_path: Path, reca
     assert damaged.startswith("5 bags could not be read whole: a/run/run_0.mcap (")
     assert ", b/run/run_0.mcap (" in damaged
     assert "and 2 more" in damaged
-    assert unread.startswith("could not be read and may hold more: f/f_0.mcap")
+    assert unread.startswith("could not be read, so messages may be missing: f/f_0.mcap")
 
 
 @pytest.mark.parametrize("topics", [1, 3])
@@ -300,7 +300,7 @@ def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
         reply = asked(memory, tool, **given_)
         assert (reply["error"], reply["reason"]) == ("no_data", "undecodable")
         assert "(keelson.Envelope) are recorded but cannot be decoded" in reply["detail"]
-        assert "may hold more: f/f_0.mcap" in str(reply["notes"])
+        assert "messages may be missing: f/f_0.mcap" in str(reply["notes"])
         of_all = "messages of 3 topics could not be decoded" in str(reply["notes"])
         assert of_all == (given_ is not window and topics == 3)
 
