@@ -39,7 +39,7 @@ def test_every_question_is_answered_rightly_and_in_few_words(server: EpisodicSer
     assert len({question.text for question in asked}) == 60
     texts = asking.replies_to(server, asked)
     assert asking.missed(asked, texts) == {}
-    assert sum(map(len, texts)) <= 64_000
+    assert sum(map(len, texts)) <= 58_000
     assert max(map(len, texts)) <= MOST_CHARS
 
 
