@@ -9,7 +9,9 @@ diagnostics each node has sightings of its own.
 
 from __future__ import annotations
 
+import json
 import math
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -22,7 +24,15 @@ from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
-from ros2_memory.core.text import Quoted, leaves, named, quote
+from ros2_memory.core.text import (
+    Quoted,
+    leaves,
+    looks_like_json,
+    named,
+    quote,
+    repeating,
+    shortened,
+)
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of
@@ -191,9 +201,12 @@ def _select_rows(
     search = ReverseSearch(view, pattern, condition)
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_latched_notes(view, search, scope.window))
-    sightings = (row for row in selected.rows if isinstance(row, Sighting))
+    sightings = [row for row in selected.rows if isinstance(row, Sighting)]
     of_moments = {row.topic for row in sightings if row.first == row.until}
     view.notes.add(*_notes_on_moments(view, sorted(of_moments)))
+    if condition.field is None:
+        of_texts = (row for row in sightings if is_text(view, row.topic))
+        view.notes.add(*islice(_key_notes(condition, of_texts), 1))
     return selected
 
 
@@ -440,6 +453,22 @@ def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
                 f"a {what} on {topic} counts for the moment in which it was said: changes, and by "
                 "value, of get_topic_in_range have for how long each held until the next one"
             )
+
+
+def _key_notes(condition: Condition, sightings: Iterable[Sighting]) -> Iterator[str]:
+    """Yields of each text of JSON that was found by its keys alone: "rain" in `{"rain_mm": 0}`."""
+    for sighting in sightings:
+        for text in filter(looks_like_json, sighting.matched):
+            with suppress(ValueError, RecursionError):
+                value = json.loads(text)
+                keys = [path for path, _ in leaves(value) if condition.matches(path)]
+                if keys and not condition.matches(value):
+                    key = shortened(keys[0])
+                    yield repeating(
+                        f"{key} of {sighting.topic} is a key of its JSON, whatever its value is: "
+                        f"a condition may be on data.{key}",
+                        [key],
+                    )
 
 
 def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> Iterator[str]:

@@ -719,6 +719,25 @@ def test_a_state_without_an_empty_text_holds_until_the_next_one(
 
 
 @each_way
+def test_a_word_that_only_a_key_of_json_has_is_said_to_be_a_key(
+    tmp_path: Path, recalls: bool
+) -> None:
+    said = ['{"sky": "light rain", "rain_mm": 1.2}', '{"sky": "sunny", "rain_mm": 0.0}']
+    weather = [text(BEGIN + 300 * nth * S, one, "/weather") for nth, one in enumerate(said)]
+    memory = remembered(tmp_path, weather, recalls=recalls)
+
+    def is_noted(value: str, **given: object) -> bool:
+        asks = {"topic": "/weather", "condition_type": "contains", "value": value, **given}
+        note = "a key of its JSON, whatever its value is: a condition may be on data.rain_mm"
+        return note in str(asked(memory, "find_matches", **asks))
+
+    assert is_noted("rain")
+    assert not is_noted("rain", end=BEGIN + 10)
+    assert not is_noted("sunny")
+    assert not is_noted("rain", field="data.sky")
+
+
+@each_way
 def test_a_rare_number_is_said_to_count_for_its_moment_alone(tmp_path: Path, recalls: bool) -> None:
     """A row of a field each 75 s; a level every second says how long it was below a limit."""
     type_name = "std_msgs/msg/Int32"
