@@ -588,7 +588,10 @@ class Arrivals:
         if not split.arrivals:
             return
         end = split.end
-        self._newest = end if end < self._newest - _SET_BACK_NS else max(self._newest, end)
+        if end < self._newest - _SET_BACK_NS:
+            self._set_back(self._newest - split.start, self._topics.keys() - split.arrivals.keys())
+            self._newest = end
+        self._newest = max(self._newest, end)
         self._splits = [
             measured
             for measured in (*self._splits, split)
@@ -608,6 +611,14 @@ class Arrivals:
                 topic.arrival, topic.resumed = arrival, arrival.first
         for name, flow in split.flows.items():
             self._topics[name].latched = flow.offered.latched
+
+    def _set_back(self, by: Ns, topics: Collection[str]) -> None:
+        """Has the clock set back for topics that have not come since: else none would be silent."""
+        for name in topics:
+            arrival = self._topics[name].arrival
+            self._topics[name].arrival = arrival._replace(
+                first=arrival.first - by, last=arrival.last - by
+            )
 
     def silent_topics(self, idle: Ns) -> frozenset[str]:
         """Returns the regular topics that have not come for ten periods, and for 10 s at least.

@@ -214,6 +214,20 @@ def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
     assert len(read_losses(tmp_path, MIN_NS, MAX_NS)) == 2
 
 
+def test_a_topic_that_ends_as_the_clock_is_set_back_is_silent(
+    tmp_path: Path, made: Reception
+) -> None:
+    for number in range(8):
+        begin = T0 + number * 10 * NS - 3600 * NS * (number > 4)
+        topics = ["/odom", "/scan"][: 1 if number > 4 else 2]
+        of_split = [
+            odom(begin + n * NS, 1.0, 0.0, topic=each) for n in range(10) for each in topics
+        ]
+        made.learn("a", write_mcap(tmp_path / f"a_{number}.mcap", of_split))
+        silent, _ = made.arrivals(0)
+        assert silent == ({"/scan"} if number > 5 else set())
+
+
 @pytest.mark.parametrize("seconds", [10, 20])
 def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
     tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch, seconds: int
