@@ -264,6 +264,7 @@ def _build_memory_days(
         memory.texts,
         memory.labels,
         memory.people,
+        tuple(settings.retention.topics),
         round(memory.max_share * settings.retention.max_total_gb * GB),
         ns_from_unix(memory.max_age_d * 86_400),
     )

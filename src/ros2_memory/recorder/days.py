@@ -137,11 +137,13 @@ class MemoryLimits(NamedTuple):
         texts: names or globs of topics whose texts may stay: speech, descriptions, logs.
         labels: labels of people that may stay.
         people: more words for people: names, roles.
+        short_lived: names or globs of topics of which nothing stays, unless they are latched.
     """
 
     texts: tuple[str, ...] = ()
     labels: tuple[str, ...] = ()
     people: tuple[str, ...] = ()
+    short_lived: tuple[str, ...] = ()
     max_bytes: int = 10**9
     max_age_ns: Ns = 400 * NS_PER_DAY
 
@@ -383,7 +385,7 @@ class MemoryDays:
         pauses = [pause for pause in thinned.pauses if near.overlaps(*pause)]
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             key = topic, _ = table.channel.topic, table.channel.type
-            reason = self._why_left_out(table)
+            reason = self._why_left_out(table, snapshot)
             if reason is not None:
                 selection.left_out[topic] = reason
             elif self._is_latched(snapshot, topic):
@@ -396,9 +398,12 @@ class MemoryDays:
             selection.times[key].update(thinning.times().tolist())
         return selection
 
-    def _why_left_out(self, table: Table) -> str | None:
+    def _why_left_out(self, table: Table, snapshot: Snapshot) -> str | None:
         """Returns why no message of a topic stays; None if some stay."""
         topic = table.channel.topic
+        lasts = topic in self.static_topics or snapshot.timeline.is_transient_state(topic)
+        if not lasts and any(match_topics((topic,), glob) for glob in self._limits.short_lived):
+            return "retention.topics gives it a shorter life"
         if "" in table.left_out:  # the whole message
             return table.left_out[""]
         if has_samples(table):

@@ -201,6 +201,17 @@ def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> 
     assert McapReader().summarize(bag_dir / DAY_FILE).complete
 
 
+def test_of_a_topic_that_retention_gives_a_shorter_life_nothing_stays(bag_dir: Path) -> None:
+    """The budget may delete its bags before that is over."""
+    splits(bag_dir, range(3))
+    keep_all(
+        bag_dir, days=days_of(bag_dir, limits=MemoryLimits(short_lived=("/vision/*/*", "/tf*")))
+    )
+    found = topics_in(bag_dir)
+    assert "/vision/scene/scene_objects" not in found
+    assert {"/odom", "/tf_static"} <= found.keys()
+
+
 def test_what_a_kill_left_unfinished_of_a_day_goes_with_the_next_pass(bag_dir: Path) -> None:
     left = bag_dir / "memory/.20260801.thinned.mcap.repair"
     left.parent.mkdir()
