@@ -135,6 +135,7 @@ def known_things(view: View, min_score: float, window: TimeWindow) -> KnownThing
     is_past = latest is None or until <= latest
     is_out_of_time = known is not None and known.since is not None and not known.crowded
     if is_past and not is_out_of_time:
+        # What was known then answers; what is known by all says whether a thing is still there.
         then = _Loader(view, min_score, MAX_NS, until).load()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
