@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
-from ros2_memory.core.arrays import Ints, concatenated, joined_codes, run_starts
+from ros2_memory.core.arrays import (
+    Ints,
+    bounds_of,
+    concatenated,
+    joined_codes,
+    run_starts,
+    stable_order,
+)
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -287,12 +294,34 @@ class Timeline:
         segments = self.segments_in(window)
         return tuple(chain.from_iterable(segment.overlapping(window) for segment in segments))
 
+    @property
+    def _recorded_spans(self) -> tuple[Ints, Ints, Ints]:
+        """The folder, first and last log time of each bag, in order.
+
+        A bag in which the clock was set ahead has two: months without a message lie between them.
+        """
+        folders, starts, ends = self.folder_numbers, self.starts, self.ends
+        rows, jumps, begin = list[int](), list[Span](), 0
+        for segment in self.segments:
+            files = segment.bags.files() if segment.set_ahead else []
+            rows += [begin + files.index(bag.file) for bag, _ in segment.set_ahead]
+            jumps += [jump for _, jump in segment.set_ahead]
+            begin += len(segment.bags)
+        if not rows:
+            return folders, starts, ends
+        before, after = bounds_of(jumps)
+        folders, starts = np.append(folders, folders[rows]), np.append(starts, after)
+        ends = np.append(ends, ends[rows])
+        ends[rows] = before
+        order = stable_order(starts)
+        return folders[order], starts[order], ends[order]
+
     @cached_property
     def shared_times(self) -> Spans:
         """The half-open spans in which bags of different recordings may hold copies, in order."""
         if not self.segments:
             return []
-        folders, starts, ends = self.folder_numbers, self.starts, self.ends
+        folders, starts, ends = self._recorded_spans
         # A run is a row of bags of one folder. Two kinds of its bags show all that it shares: bags
         # that begin before an earlier run has ended, and the bag that ends last.
         begins = run_starts(folders)

@@ -45,6 +45,25 @@ def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> No
     assert [snapshot.longest_silence(topic) for topic in ("/odom", "/seen")] == [0, 300 * S]
 
 
+def test_a_bag_in_which_the_clock_was_set_ahead_shares_no_time_with_the_months_between() -> None:
+    """Else each scan of these months would compare all of their messages with those of others."""
+    jump, now = 100 * S, 200 * 86_400 * S
+    others = [
+        _bag(f"/b/rec/rec_{n}.mcap", ("/odom", n * now // 50, (n + 1) * now // 50))
+        for n in range(50)
+    ]
+    boot = _bag("/b/boot/boot_0.mcap", ("/odom", 0, now))
+    schema = SummarySchema(pauses=((jump, now - jump),))
+    boot = boot._replace(summary=BagSummary.packed(boot.summary.topics, schema))
+    halves = [
+        _bag(f"/b/boot/boot_{n}.mcap", ("/odom", *half))
+        for n, half in enumerate([(0, jump), (now - jump, now)])
+    ]
+    shared = Timeline.of([*others, *halves]).shared_times
+    assert Timeline.of([*others, boot]).shared_times == shared
+    assert sum(stop - start for start, stop in shared) < 3 * jump
+
+
 NAMES = ("rec/{}.mcap", "rec/rec_{:021}.mcap.zstd", "/bägs/._{}", "/{}", "a/{}.db3", "b/x{}y")
 
 bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))
