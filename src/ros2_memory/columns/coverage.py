@@ -101,8 +101,8 @@ class Coverage:
     def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields what `Timeline.extents` yields, of the bags that are not stored."""
         for covered in self.segments:
-            bags, is_missing = covered.segment.bags, covered.is_missing
-            is_missing &= window.overlapping(bags.starts, bags.ends)
+            bags = covered.segment.bags
+            is_missing = covered.is_missing & window.overlapping(bags.starts, bags.ends)
             if is_missing.any():
                 yield from covered.segment.extents(topic, window, is_missing)
 
