@@ -128,6 +128,12 @@ def state_of(value: JsonValue, type_name: str) -> State:
     return State(tuple(tracked), counts.total() - len(tracked))
 
 
+def node_of(value: JsonValue) -> str:
+    """Returns the node that publishes diagnostics, by the first status of an extracted message."""
+    names = (status.get("name") for status in _entries(value, "status"))
+    return shortened(next((name for name in names if isinstance(name, str)), ""), _MAX_CHARS)
+
+
 def charge_of(value: JsonValue) -> float | None:
     """Returns how full the battery of an extracted message is, 0 to 1.
 

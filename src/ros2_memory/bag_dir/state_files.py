@@ -796,7 +796,7 @@ class RuleRecord:
         always_since: since when it has matched without an end; None unless that is long.
         begun: the log times at which the moments of the last hour began.
         newest: the moments that are not stored yet, and the newest one, in order.
-        runs: the matches that go on, by topic.
+        runs: the matches that go on, by topic; those of diagnostics by topic and node.
     """
 
     fired: Count = 0

@@ -27,6 +27,7 @@ from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from ros2_memory.analysis.facts import DIAGNOSTICS, node_of
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start, split_number
@@ -161,6 +162,21 @@ class Rule:
             return None
         run.fired = True
         return Firing(self.name, topic, run.first, run.first + self.hold)
+
+
+def _source_of(event: _Event, value: JsonValue | UndecodableError) -> str:
+    """Returns whose match a message goes on or ends: its topic's, and of diagnostics its node's."""
+    if event.record is None or isinstance(value, UndecodableError):
+        return event.topic
+    is_of_node = event.record.channel.type == DIAGNOSTICS
+    return f"{event.topic} {node_of(value)}" if is_of_node else event.topic
+
+
+def _drop_ended(runs: MutableMapping[str, RunRecord], begin: str, time: Ns) -> None:
+    """Drops the matches of nodes that are silent, by the begin of their names: none goes on."""
+    for name, run in [*runs.items()]:
+        if name.startswith(begin) and not run.lasts and time - run.last > SILENCE_NS:
+            del runs[name]
 
 
 class SearchPart(NamedTuple):
@@ -376,7 +392,10 @@ class SplitSearch:
                 continue  # its publisher is silent until something changes
             matches = None if record is None else self._test(rule, record.channel, value, state)
             runs = state.rules[rule.name].runs
-            fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
+            source = event.topic if rule.kind == "silent" else _source_of(event, value)
+            if source != event.topic:
+                _drop_ended(runs, f"{event.topic} ", event.time)
+            fired = rule.take(runs, source, event.time, matches=matches, latched=latched)
             if fired is not None:
                 yield fired
 

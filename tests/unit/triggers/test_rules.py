@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import RunRecord
-from tests.support.bags import Msg, boolean
+from tests.support.bags import Msg, boolean, diagnostics
 from tests.support.examples import examples
 from tests.support.watched_bags import SILENT, T0, S, WatchedBags, flag, rule
 
@@ -194,3 +194,23 @@ def test_the_field_of_a_rule_may_be_a_full_path(tmp_path: Path) -> None:
     robot.split([flag(0, False), flag(1, True)])
     robot.close_all()
     assert robot.fired_at() == [1]
+
+
+@pytest.mark.parametrize(("hold_s", "fires_at"), [(0, [5]), (3, [8]), (30, [])])
+def test_what_other_nodes_report_does_not_end_the_error_of_one(
+    tmp_path: Path, hold_s: int, fires_at: list[float]
+) -> None:
+    """The lidar has an error from 5 s on; the camera, which is fine, reports between."""
+    lost = parse_condition("contains", "no data", 0.5)
+    robot = WatchedBags(
+        tmp_path / "bags", [rule(topic="/diagnostics", condition=lost, hold=hold_s * S)]
+    )
+    robot.begin(T0)
+    messages = []
+    for second in range(20):
+        at = T0 + second * S
+        messages.append(diagnostics(at, lidar=(2, "no data") if second >= 5 else (0, "")))
+        messages.append(diagnostics(at + 1000, camera=(0, "")))
+    robot.split(messages)
+    robot.close_all()
+    assert robot.fired_at() == fires_at
