@@ -645,11 +645,11 @@ def test_coordinates_and_a_place_of_one_name_are_two_rows(
 
 
 def test_of_several_topics_of_poses_the_refusal_says_which_is_best(tmp_path: Path) -> None:
-    """Of two filters of robot_localization, the one in the map follows a satellite receiver."""
-    poses = [replace(odom(T0), topic=topic) for topic in ("/odometry/global", "/odometry/local")]
+    """Of two filters, the one in the map follows a satellite receiver."""
+    poses = [replace(odom(T0), topic=topic) for topic in ("/filters/global", "/filters/local")]
     refused = asked(remembered(tmp_path, poses), "get_position_at", timestamp=T0_S)
     assert refused["detail"].endswith(
-        "poses are on /odometry/global (nav_msgs/msg/Odometry), /odometry/local "
+        "poses are on /filters/global (nav_msgs/msg/Odometry), /filters/local "
         "(nav_msgs/msg/Odometry): set data.pose_topic to one of them (best to odometry that no "
         "localisation corrects), or give topic where the tool takes it"
     )
