@@ -40,7 +40,7 @@ class Detected(NamedTuple):
 
     Attributes:
         log_times: log time of each message (ns).
-        stamps: header stamp of each message (ns), or its log time if it has no stamp.
+        stamps: header stamp of each message (ns), or its log time if it has no stamp or 0.
         found: the detections; `rows` says which message each is from. Places are rounded to 0.1 mm,
             as in the store.
         frames: frame of each message's header; empty if it names none.
@@ -65,7 +65,7 @@ class Detected(NamedTuple):
         """Returns the messages from a log time (ns) on, without repeated ones.
 
         A detector that hangs publishes its last message again and again: with equal stamp, frame
-        and detections. A stamp of 0 counts as none.
+        and detections.
         """
         rows, labels, scores, places, frames = self.found
         columns = np.column_stack((labels.codes, frames.codes, scores, places))
@@ -75,7 +75,7 @@ class Detected(NamedTuple):
         headers = zip(self.stamps.tolist(), self.frames.codes.tolist(), strict=True)
         for message, (stamp, frame) in enumerate(headers):
             content = columns[begins[message] : begins[message + 1]].tobytes()
-            if stamp and last_content.get((stamp, frame)) == content:
+            if last_content.get((stamp, frame)) == content:
                 is_new[message] = False
             last_content[stamp, frame] = content
         new = np.flatnonzero(is_new)
@@ -135,6 +135,7 @@ class DetectionRows:
         if rows.index is not None:
             detections = detections.at(rows.index)
         stamps = rows.times if stamps is None else stamps[rows.positions]
+        stamps = np.where(stamps == 0, rows.times, stamps)
         return Detected(rows.times, stamps, detections, frames[rows.positions])
 
     def _read_messages(self, rows: Rows) -> Detected:
@@ -180,5 +181,5 @@ def _stamp_or_log_time(view: View, stored: StoredMessage) -> Ns:
 
 
 def stamp_of(message: object) -> Ns | None:
-    """Returns the header stamp of a message (ns); None if it has none."""
-    return nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
+    """Returns the header stamp of a message (ns); None if it has none, or 0: not filled in."""
+    return nanoseconds(getattr(getattr(message, "header", None), "stamp", None)) or None

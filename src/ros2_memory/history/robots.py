@@ -134,6 +134,23 @@ def _shared_topics(view: View) -> Iterator[str]:
 
 def _contradicting_frames(view: View) -> Iterator[str]:
     """Yields a sentence on each static frame that has different parents in two recordings."""
+    contradicting: set[str] = set()
+    for (first, parents), (other, others) in combinations(_static_trees(view).items(), 2):
+        for frame in sorted(parents.keys() & others.keys() - contradicting):
+            if parents[frame] != others[frame]:
+                contradicting.add(frame)
+                yield (
+                    f"the frame {frame} is in {parents[frame]} in the recording "
+                    f"{_name(view, first)}, and in {others[frame]} in {_name(view, other)}, as of "
+                    "two robots"
+                )
+
+
+def _static_trees(view: View) -> dict[str, Mapping[str, str]]:
+    """Returns the parents of static frames by recording, without those that time is too short for.
+
+    Those of closed bags are remembered until a bag of theirs comes or goes.
+    """
     remembered = view.memory.memo.of(_TREES, dict)
     known = dict(remembered)
     remembered.clear()
@@ -143,19 +160,10 @@ def _contradicting_frames(view: View) -> Iterator[str]:
         try:
             trees[path] = known[key] if key in known else _static_parents(view, bags)
         except QueryTimeoutError:
-            break
+            continue
         if not any(bag.state is BagState.ACTIVE for bag in bags):
             remembered[key] = trees[path]
-    contradicting: set[str] = set()
-    for (first, parents), (other, others) in combinations(trees.items(), 2):
-        for frame in sorted(parents.keys() & others.keys() - contradicting):
-            if parents[frame] != others[frame]:
-                contradicting.add(frame)
-                yield (
-                    f"the frame {frame} is in {parents[frame]} in the recording "
-                    f"{_name(view, first)}, and in {others[frame]} in {_name(view, other)}, as of "
-                    "two robots"
-                )
+    return trees
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:

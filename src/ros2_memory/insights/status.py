@@ -13,6 +13,7 @@ from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.errors import BagError, NotInLakeError, RefusedError, UndecodableError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
@@ -321,9 +322,10 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         usual_period = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual_period, snapshot.longest_silence(topic))
         since = TimeWindow(last + 1, latest + 1)
-        excluded = length_in(excluded_spans(memory.bag_dir, since), last, latest)
-        is_long = latest - last - excluded > max(SILENT_AFTER_NS, longest)
+        unrecorded = united([*excluded_spans(memory.bag_dir, since), *snapshot.gaps])
+        silent = latest - last - length_in(unrecorded, last, latest)
         is_cut = bool(cut_spans(memory.bag_dir, topic, since))
+        is_long = silent > max(SILENT_AFTER_NS, longest)
         if is_long and not is_cut and not are_unlisted(memory, [topic]):
             yield SilentTopic(topic, last)
 

@@ -231,7 +231,7 @@ def _hung_since(view: View, topic: str, window: TimeWindow) -> Ns | None:
     """
     newest = view.stream.newest(topic, window)
     stamp = stamp_of(view.bags.decode(newest))
-    if newest is None or not stamp or newest.time - stamp <= LONGEST_LATENCY_NS:
+    if newest is None or stamp is None or newest.time - stamp <= LONGEST_LATENCY_NS:
         return None
     before = view.stream.newest(topic, TimeWindow(window.start, newest.time))
     repeats = before is not None and before.record.payload == newest.record.payload

@@ -12,6 +12,7 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.history import robots
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
@@ -380,6 +381,23 @@ def test_a_frame_with_two_parents_is_two_robots_until_a_recording_is_replaced_or
     write_mcap(tmp_path / "blue" / "blue_1.mcap", [mounted("torso", later + 60 * S)])
     clock.at += 300 * S
     assert len(warned(memory)) == 1
+
+
+def test_frames_that_are_known_contradict_each_other_without_time_for_others(
+    tmp_path: Path,
+) -> None:
+    clock = SettableClock(T0 + 9 * 3600 * S)
+    for hours, name, parent in ((1, "a", "base_link"), (2, "b", "base_link"), (3, "c", "torso")):
+        record(tmp_path, name, [mounted(parent, T0 + hours * 3600 * S)])
+    memory = memory_of(tmp_path, clock=clock)
+    assert len(warned(memory)) == 1
+    (tmp_path / "a" / "a_0.mcap").unlink()
+    record(tmp_path, "a", [mounted("base_link", T0 + 3660 * S)])
+    memory.index.refresh()
+    clock.at += 300 * S
+    late = Call(deadline=Deadline.after(-1.0))
+    (note,) = robots.describe_mixed(memory, late)
+    assert "laser is in base_link in the recording b, and in torso in c" in note
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3"])

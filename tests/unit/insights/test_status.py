@@ -214,6 +214,17 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     assert [each.topic for each in answer.fell_silent] == fell
 
 
+def test_the_time_that_a_robot_was_off_is_no_silence_of_its_slow_topics(tmp_path: Path) -> None:
+    charges = [boolean(BEGIN + t * S, True, topic="/charging") for t in range(0, 3600, 300)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", in_order([*along_x(BEGIN, 3600), *charges]))
+    morning = BEGIN + 9 * 3600 * S
+    write_mcap(tmp_path / "b" / "b_0.mcap", along_x(morning, 100))
+    assert memory_status(memory_of(tmp_path), Call()).fell_silent == ()
+    write_mcap(tmp_path / "b" / "b_1.mcap", along_x(morning + 100 * S, 3600))
+    answer = memory_status(memory_of(tmp_path), Call())
+    assert [each.topic for each in answer.fell_silent] == ["/charging"]
+
+
 @pytest.mark.parametrize("is_listed", [False, True])
 def test_a_topic_that_was_taken_from_the_list_is_not_silent(
     tmp_path: Path, is_listed: bool

@@ -32,8 +32,11 @@ from ros2_memory.things.instances import Estimate
 from ros2_memory.things.places import places_of
 from tests.support.bags import (
     Msg,
+    along_x,
     detected,
+    detections,
     header,
+    in_order,
     make,
     odom,
     text,
@@ -44,7 +47,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.clocks import in_zone
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, remembered, with_store
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -939,6 +942,23 @@ def test_what_was_taken_away_one_by_one_is_missed_on_an_empty_bench(tmp_path: Pa
     reply = told_of(tmp_path, messages)
     assert len(reply["things"]) == 3
     assert all("not_seen_where_expected" in thing["still_there"] for thing in reply["things"])
+
+
+def test_a_stamp_that_was_not_filled_in_is_no_time_also_where_time_begins_at_zero(
+    tmp_path: Path,
+) -> None:
+    """Of a simulation: its first seconds agree with a stamp of 0."""
+    drive = along_x(0, 60, mps=0.5, hz=10)
+    drive += [
+        tf(n * S // 10, transform(n * S // 10, "odom", "base_link", (n * 0.05, 0.0, 0.0)))
+        for n in range(600)
+    ]
+    for at in range(4, 8):
+        seen = detections(0, ["cup"], at=(4.0 - 0.5 * at, 0.0, 0.0))
+        drive.append(replace(seen, log_time=at * S))
+    memory = remembered(tmp_path, in_order(drive), limits=QuerySettings(now="latest"))
+    [cup] = asked(memory, "find_things", label="cup")["things"]
+    assert (cup["place"]["x"], cup["count"]) == (4.0, 4)
 
 
 @pytest.mark.parametrize("repeated", [(), (("crate", 3.0, 0.0),)], ids=["nothing", "a crate"])
