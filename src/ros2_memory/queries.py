@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagFile, JsonValue, Pose, Sample, TimeWindow
-from ros2_memory.core.text import listed, match_topics
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     FUTURE_NS,
@@ -331,11 +331,12 @@ def _note_samples(view: View, read: _Samples) -> None:
     """Notes what samples leave out of all messages of a window."""
     view.notes.add(*read.notes)
     for why, count in read.undecodable.items():
-        view.notes.add(f"{count} samples left out: {why}")
+        view.notes.add(f"{counted(count, 'sample')} left out: {why}")
     if len(read.types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(read.types)}")
     if read.unnamed:
-        view.notes.add(f"{read.unnamed} samples left out: they say nothing of the fields")
+        samples = counted(read.unnamed, "sample")
+        view.notes.add(f"{samples} left out, without any of the fields")
 
 
 def _read_samples(
@@ -372,7 +373,7 @@ def _read_samples(
     for detail, count in lacking.items():
         if not read.samples:
             raise InvalidArgumentsError(detail)
-        view.notes.add(f"{count} samples left out: {detail}")
+        view.notes.add(f"{counted(count, 'sample')} left out: {detail}")
     return read
 
 

@@ -280,7 +280,7 @@ def _show_times(axes: "Axes", span: Seconds) -> None:
     locator = AutoDateLocator(tz=zone)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator, tz=zone))
-    axes.set_xlim(start / _DAY_S, end / _DAY_S)
+    axes.set_xlim(start / _DAY_S, max(end, start + _SHORTEST_S) / _DAY_S)
 
 
 def read_signals(

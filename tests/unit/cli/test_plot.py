@@ -97,6 +97,14 @@ def test_the_path_of_a_time_that_a_wrong_clock_gave_is_drawn(
     assert (tmp_path / "x.svg").is_file()
 
 
+def test_a_time_in_which_one_moment_was_recorded_is_drawn(
+    bags: Path, tmp_path: Path, exits: Program
+) -> None:
+    until = (T0 + 1000) / NS_PER_S
+    exits(0, f"plot recap {bags} --out {tmp_path}/x.svg --start {until - 5} --end {until}")
+    assert (tmp_path / "x.svg").is_file()
+
+
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
     signals, _ = plot.read_signals(whole_memory(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]

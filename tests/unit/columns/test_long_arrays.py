@@ -232,7 +232,7 @@ def test_samples_of_a_joint_are_messages_that_name_it(tmp_path: Path) -> None:
         assert few["total"] == 40
         every = lift(start=begin + 10, end=begin + 15)
         assert [row[1] for row in every["rows"]] == [1, 1.2, 1.4]
-        assert every["notes"] == ["3 samples left out: they say nothing of the fields"]
+        assert every["notes"] == ["3 samples left out, without any of the fields"]
         both = samples(fields=["positions.lift", "positions.elbow"], start=begin, end=begin + 1)
         assert [row[1:] for row in both["rows"]] == [[0, None], [None, 0]]
         none = lift(start=begin + 41, end=begin + 45)
