@@ -140,21 +140,21 @@ class IntervalTable(NamedTuple):
         return IntervalTable(labels, rows.tobytes())
 
     def most_telling(self, at_most: int) -> list[tuple[VisibleInterval, int]]:
-        """Returns the longest interval of each label, then those of rare labels, then the others.
+        """Returns some intervals of the rarest labels, then the longest of all others.
 
-        Of equally rare ones the longest comes first. Beside each is how many are as rare: as many
-        as there are labels, or as its label has intervals if these are more.
+        Those of rare labels are a fifth, of equally rare ones the longest. Beside each interval is
+        how many are of its kind: rare, or any.
         """
         by_length = self._by_length()
-        label = self._array["label"][by_length]
-        _, firsts, nth, sizes = np.unique(
-            label, return_index=True, return_inverse=True, return_counts=True
+        _, nth, sizes = np.unique(
+            self._array["label"][by_length], return_inverse=True, return_counts=True
         )
-        often = np.maximum(sizes, len(sizes))[nth]
-        often[firsts] = len(sizes)
-        order = stable_order(often)[:at_most]
+        rarest = stable_order(sizes[nth])[: at_most // 5]
+        others = np.delete(np.arange(self.size), rarest)[: at_most - len(rarest)]
+        order = np.concatenate((rarest, others))
+        often = np.repeat((len(rarest), self.size), (len(rarest), len(others)))
         intervals = self._select(by_length[order]).intervals()
-        return [*zip(intervals, often[order].tolist(), strict=True)]
+        return [*zip(intervals, often.tolist(), strict=True)]
 
     def longest_of_each(self) -> IntervalTable:
         """Returns the longest interval of each label; of equally long ones the earliest."""

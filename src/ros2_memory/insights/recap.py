@@ -467,7 +467,7 @@ class _ThingsInView(NamedTuple):
     """Things that came into view or left it.
 
     Attributes:
-        events: the longest sight of each thing, and others of things that are rarely seen.
+        events: sights of things that are rarely seen, and the longest others.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
         longest_of_each: the longest sight of each other label, in order of time.
@@ -718,8 +718,8 @@ def _most_important(
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
     What happens on any day comes last, the rare before the frequent: two changes of an emergency
-    stop, then the stops, then a door that opens all the time. The longest sights of each thing are
-    a kind of their own. `counts` has how many there are of each kind; there may be more than
+    stop, then the stops, then a door that opens all the time. Some sights of what is rarely seen
+    are a kind of their own. `counts` has how many there are of each kind; there may be more than
     `events`. A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))

@@ -161,7 +161,8 @@ class Rule:
         if run is None or run.fired or time - run.first < self.hold:
             return None
         run.fired = True
-        return Firing(self.name, topic, run.first, run.first + self.hold)
+        # Without the node: names of topics have no spaces.
+        return Firing(self.name, topic.partition(" ")[0], run.first, run.first + self.hold)
 
 
 def _source_of(event: _Event, value: JsonValue | UndecodableError) -> str:

@@ -290,7 +290,7 @@ def test_a_thing_that_is_rarely_seen_is_listed_among_things_that_are_seen_all_da
     assert dict(told.counts) == {"on/off changes": 79, "sightings": 83}
     assert len(texts) == MOST_EVENTS
     assert texts.count("deer in view") == 3
-    assert {"post in view", "grape in view"} <= {*texts}
+    assert sum("in view" in text for text in texts) == MOST_EVENTS // 5
 
 
 def test_a_path_that_begins_or_ends_within_a_window_says_when_there_are_no_poses(
