@@ -139,22 +139,9 @@ class IntervalTable(NamedTuple):
         rows["label"], labels = sorted_codes(rows["label"], self.labels)
         return IntervalTable(labels, rows.tobytes())
 
-    def most_telling(self, at_most: int) -> list[tuple[VisibleInterval, int]]:
-        """Returns some intervals of the rarest labels, then the longest of all others.
-
-        Those of rare labels are a fifth, of equally rare ones the longest. Beside each interval is
-        how many are of its kind: rare, or any.
-        """
-        by_length = self._by_length()
-        _, nth, sizes = np.unique(
-            self._array["label"][by_length], return_inverse=True, return_counts=True
-        )
-        rarest = stable_order(sizes[nth])[: at_most // 5]
-        others = np.delete(np.arange(self.size), rarest)[: at_most - len(rarest)]
-        order = np.concatenate((rarest, others))
-        often = np.repeat((len(rarest), self.size), (len(rarest), len(others)))
-        intervals = self._select(by_length[order]).intervals()
-        return [*zip(intervals, often.tolist(), strict=True)]
+    def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
+        """Returns the longest intervals, the longest first; of equal ones the earliest first."""
+        return self._select(self._by_length()[:at_most]).intervals()
 
     def longest_of_each(self) -> IntervalTable:
         """Returns the longest interval of each label; of equally long ones the earliest."""

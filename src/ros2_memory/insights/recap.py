@@ -467,7 +467,7 @@ class _ThingsInView(NamedTuple):
     """Things that came into view or left it.
 
     Attributes:
-        events: sights of things that are rarely seen, and the longest others.
+        events: the things that were seen longest.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
         longest_of_each: the longest sight of each other label, in order of time.
@@ -518,14 +518,14 @@ def _things_in_view(
         things = things.during([stay.span for stay in region_stays.stays])
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
     return _ThingsInView(
-        [_sight_event(*interval, last_seen) for interval in things.most_telling(most)],
+        [_sight_event(interval, last_seen) for interval in things.longest(most)],
         things.size,
         throughout,
-        [_sight_event(interval, 1, last_seen) for interval in longest_of_each],
+        [_sight_event(interval, last_seen) for interval in longest_of_each],
     )
 
 
-def _sight_event(interval: VisibleInterval, often: int, last_seen: Mapping[str, Ns]) -> Event:
+def _sight_event(interval: VisibleInterval, last_seen: Mapping[str, Ns]) -> Event:
     """Returns a sight of a thing; it goes on if the label was last seen (ns) at its end."""
     label = interval.label
     return Event(
@@ -536,7 +536,6 @@ def _sight_event(interval: VisibleInterval, often: int, last_seen: Mapping[str, 
         goes_on=interval.last == last_seen.get(label),
         score=interval.best,
         label=label,
-        often=often,
     )
 
 
@@ -718,15 +717,13 @@ def _most_important(
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
     What happens on any day comes last, the rare before the frequent: two changes of an emergency
-    stop, then the stops, then a door that opens all the time. Some sights of what is rarely seen
-    are a kind of their own. `counts` has how many there are of each kind; there may be more than
-    `events`. A note says how many are left out; one alone is not.
+    stop, then the stops, then a door that opens all the time. `counts` has how many there are of
+    each kind; there may be more than `events`. A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))
 
     def rank(event: Event) -> tuple[int, int, int, Ns]:
-        kind = _KINDS.index(event.kind)
-        often = event.often or alike[_boolean_of(event) or event.kind]
+        kind, often = _KINDS.index(event.kind), alike[_boolean_of(event) or event.kind]
         lasted = (event.end or event.start) - event.start
         return min(kind, _OF_ANY_DAY), often, kind, -lasted
 

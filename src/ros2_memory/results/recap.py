@@ -247,7 +247,6 @@ class Event:
         point: where the robot was (m), in the frame of the recap; None if that is not known.
         topic: whose message it is, of booleans; else empty.
         label: of a thing in view; else empty.
-        often: how many sights are as rare, see `IntervalTable.most_telling`; 0 for other events.
     """
 
     kind: str
@@ -262,7 +261,6 @@ class Event:
     point: tuple[float, float] | None = None
     topic: str = ""
     label: str = ""
-    often: int = 0
 
 
 @result(

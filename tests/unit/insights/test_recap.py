@@ -275,24 +275,6 @@ def test_of_many_stops_and_toggles_the_rare_are_listed_first(tmp_path: Path) -> 
     assert f"{34 - (MOST_EVENTS - 2)} stops, {34 * 8 // 3} on/off changes" in left_out
 
 
-def test_a_thing_that_is_rarely_seen_is_listed_among_things_that_are_seen_all_day(
-    tmp_path: Path,
-) -> None:
-    """Along 40 rows of a vineyard a tractor sees posts and grapes, tills, and meets three deer."""
-    messages = []
-    for second in range(40 * 20):
-        at, in_row = BEGIN + second * S, second % 20 < 15
-        labels = ["post", "grape"] * in_row + ["deer"] * (second % 390 < 4)
-        messages.append(detections(at, labels, topic="/vision/objects"))
-        messages.append(boolean(at, in_row, topic="/tilling"))
-    told = over(remembered(tmp_path, messages), 0, 40 * 20)
-    texts = [event.text for event in told.events]
-    assert dict(told.counts) == {"on/off changes": 79, "sightings": 83}
-    assert len(texts) == MOST_EVENTS
-    assert texts.count("deer in view") == 3
-    assert sum("in view" in text for text in texts) == MOST_EVENTS // 5
-
-
 def test_a_path_that_begins_or_ends_within_a_window_says_when_there_are_no_poses(
     tmp_path: Path,
 ) -> None:
