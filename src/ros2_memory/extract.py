@@ -614,7 +614,10 @@ def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> st
     in_text = ""
     if texts:
         key = path.removeprefix(f"{texts[0]}.")
-        in_text = f"; {texts[0]} is a text of JSON: a condition may be on {texts[0]}.{key}"
+        in_text = (
+            f"; {texts[0]} is a text of JSON: a condition, changes, by value and with may be on "
+            f"{texts[0]}.{key}"
+        )
     return (
         f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {fields}{in_text}"

@@ -15,7 +15,7 @@ import json
 import math
 from bisect import bisect_left, bisect_right
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -33,7 +33,15 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
+from ros2_memory.messages.conversions import (
+    ABSENT,
+    Summary,
+    descend,
+    names_beside,
+    names_others,
+    single_values,
+)
+from ros2_memory.messages.detections import parsed_json
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -141,7 +149,9 @@ class HeldValues:
     def _require_single_value(self, asked: str, until: Ns) -> None:
         window = TimeWindow(MIN_NS, until)
         messages = self._view.stream.messages([self._topic], window, newest_first=True)
-        newest, value = next(self._stated(islice(messages, _MOST_TRIED)), (None, None))
+        stated = self._stated(islice(messages, _MOST_TRIED))
+        # An empty text, which only ends a value, says nothing of the keys of others.
+        newest, value = next((pair for pair in stated if pair[1] != ""), (None, None))
         if newest is None:
             names = self._field and names_without(self._view, self._topic, self._field, until)
             if self._field and names:
@@ -328,12 +338,23 @@ class HeldValues:
         value = (
             extractor.exact(message, type_name)
             if field is None
-            else extractor.exact_at(message, type_name, field)
+            else self._field_of(message, type_name, field)
         )
         # A summary stands for an array that is too long to be shown.
         if isinstance(value, dict) and len(value) == 1 and not isinstance(value, Summary):
             [value] = value.values()
         return _canonical(value)
+
+    def _field_of(self, message: object, type_name: str, field: str) -> JsonValue:
+        """Returns a field, which may go on into a text of JSON; a blank text says it has none."""
+        value = self._view.extractor.exact_at(message, type_name, field)
+        segments = field.split(".")
+        for nth in range(1, len(segments) if value is None else 0):
+            text = self._view.extractor.exact_at(message, type_name, ".".join(segments[:nth]))
+            if isinstance(text, str):
+                inner = descend(parsed_json(text), segments[nth:]) if text.strip() else text
+                return None if inner is ABSENT else cast("JsonValue", inner)
+        return value
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""

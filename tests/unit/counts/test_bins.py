@@ -34,7 +34,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import in_zone
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import asked, each_way, memory_of, remembered, with_store
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import write_moving_map
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
@@ -429,6 +429,32 @@ def tags(at: int, *numbers: int) -> Msg:
 def cups(at: int, *numbers: int) -> Msg:
     things = [("cup" if each == 7 else "pot", 0.9, (1.0, 0.0, 0.0)) for each in numbers]
     return detected(at, things, topic="/detections")
+
+
+def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> None:
+    """As of deliveries, each of which has some states; the newest text is an empty one."""
+    states = [("D1", "loading"), ("D1", "done"), (), ("D2", "loading"), ("D2", "failed"), ()]
+    said = [
+        text(
+            (T + 10 * at) * S,
+            json.dumps({"id": state[0], "is": {"state": state[1]}}) if state else "",
+        )
+        for at, state in enumerate(states)
+    ]
+    bumped = [boolean((T + at) * S, at == 33) for at in range(60)]
+    window = {"start": T, "end": T + 59}
+    plain = remembered(tmp_path, [*said, *bumped])
+    for memory in (plain, with_store(plain, tmp_path)):
+        ask = partial(asked, memory, "get_topic_in_range", topic="/chatter", **window)
+        for field in ("data.id", "value.id"):
+            rows = ask(by="value", fields=[field])["rows"]
+            assert [row[:3] for row in rows] == [["D1", 1, 20.0], ["D2", 1, 20.0]]
+        changes = ask(changes=True, fields=["data.is.state"])["changes"]
+        assert [change["value"] for change in changes] == ["loading", "done", "loading", "failed"]
+        bump = {"topic": "/bumper", "condition_type": "equals", "value": True}
+        reply = asked(memory, "find_matches", **bump, **{"with": "/chatter.data.id"})
+        assert reply["sightings"][0]["with"][0]["value"] == "D2"
+        assert "has no field" in ask(by="value", fields=["data.name"])["detail"]
 
 
 def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
