@@ -150,8 +150,12 @@ class HeldValues:
         window = TimeWindow(MIN_NS, until)
         messages = self._view.stream.messages([self._topic], window, newest_first=True)
         stated = self._stated(islice(messages, _MOST_TRIED))
-        # An empty text, which only ends a value, says nothing of the keys of others.
-        newest, value = next((pair for pair in stated if pair[1] != ""), (None, None))
+        # An empty text, which only ends a value, says nothing of the keys of others; and not each
+        # text of JSON has all keys.
+        said = (pair for pair in stated if pair[1] != "")
+        newest, value = next(said, (None, None))
+        if newest is not None and value is None and newest.type == TEXT:
+            newest, value = next((pair for pair in said if pair[1] is not None), (newest, None))
         if newest is None:
             names = self._field and names_without(self._view, self._topic, self._field, until)
             if self._field and names:

@@ -434,13 +434,12 @@ def cups(at: int, *numbers: int) -> Msg:
 def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> None:
     """As of deliveries, each of which has some states; the newest text is an empty one."""
     states = [("D1", "loading"), ("D1", "done"), (), ("D2", "loading"), ("D2", "failed"), ()]
-    said = [
-        text(
-            (T + 10 * at) * S,
-            json.dumps({"id": state[0], "is": {"state": state[1]}}) if state else "",
-        )
+    why = [{}, {"why": "lost"}, {}, {}, {}, {}]
+    reports = [
+        json.dumps({"id": state[0], "is": {"state": state[1]}} | why[at]) if state else ""
         for at, state in enumerate(states)
     ]
+    said = [text((T + 10 * at) * S, report) for at, report in enumerate(reports)]
     bumped = [boolean((T + at) * S, at == 33) for at in range(60)]
     window = {"start": T, "end": T + 59}
     plain = remembered(tmp_path, [*said, *bumped])
@@ -455,6 +454,8 @@ def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> Non
         reply = asked(memory, "find_matches", **bump, **{"with": "/chatter.data.id"})
         assert reply["sightings"][0]["with"][0]["value"] == "D2"
         assert "has no field" in ask(by="value", fields=["data.name"])["detail"]
+        changes = ask(changes=True, fields=["data.why"])["changes"]
+        assert [change["value"] for change in changes] == [None, "lost", None]
 
 
 def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
