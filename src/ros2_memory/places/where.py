@@ -24,7 +24,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, contains
+from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, Storey, contains
 from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
@@ -58,10 +58,11 @@ PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
 _EXPECTED: Final = (
     "give the name of a place, "
-    '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m); '
+    '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m), of one storey with '
+    '"z": [2, 4]; '
     'several as "kitchen, hall", or by name: {"kitchen": {"x": [0, 5], "y": [5, 9]}, "hall": ...}'
 )
-_REGION_KEYS: Final = frozenset({"x", "y", "radius_m"})
+_REGION_KEYS: Final = frozenset({"x", "y", "z", "radius_m"})
 _MOST_PLACES: Final = 30
 _UNNAMED: Final = "where"
 """What tables call a region without a name."""
@@ -108,10 +109,14 @@ class Where:
         region = self.region
         if self.name is not None:
             return self.name
+        heights: JsonObject = {}
+        if isinstance(region, Storey):
+            heights["z"] = [region.low, region.high]
+            region = region.plan
         if isinstance(region, Circle):
-            return {"x": region.x, "y": region.y, "radius_m": region.radius_m}
+            return {"x": region.x, "y": region.y, **heights, "radius_m": region.radius_m}
         min_x, max_x, min_y, max_y = region.bounds
-        return {"x": [min_x, max_x], "y": [min_y, max_y]}
+        return {"x": [min_x, max_x], "y": [min_y, max_y], **heights}
 
 
 def parse_where(
@@ -207,9 +212,20 @@ def _parse_place(
 
 
 def _region_of(value: JsonValue, default_radius_m: float | None) -> Region | None:
-    """Returns the rectangle or circle that an object describes; None if it describes none."""
+    """Returns the region that an object describes, with its heights; None if it describes none."""
     if not isinstance(value, dict) or value.keys() - _REGION_KEYS:
         return None
+    plan, heights = _plan_of(value, default_radius_m), value.get("z")
+    if plan is None or heights is None:
+        return plan
+    match heights:
+        case [bottom, top] if -math.inf < as_float(bottom) < as_float(top) < math.inf:
+            return Storey(plan, as_float(bottom), as_float(top))
+    return None
+
+
+def _plan_of(value: JsonObject, default_radius_m: float | None) -> Circle | Rectangle | None:
+    """Returns the rectangle or circle that an object describes; None if it describes none."""
     match value:
         case {"x": [_, _] as x_range, "y": [_, _] as y_range} if "radius_m" not in value:
             min_x, max_x, min_y, max_y = bounds = [as_float(end) for end in (*x_range, *y_range)]

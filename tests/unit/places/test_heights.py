@@ -62,6 +62,25 @@ def test_the_robot_is_in_the_place_of_its_storey_alone(memory: Memory, name: str
     assert by_hour["all"]["minutes"] == pytest.approx(row["duration_s"] / 60, abs=0.01)
 
 
+def test_a_question_may_ask_about_coordinates_at_some_heights(memory: Memory) -> None:
+    plan = {"x": [-1.0, 4.0], "y": [-1.0, 1.0]}
+    up = plan | {"z": [2.0, 9.0]}
+    asks: tuple[tuple[str, dict[str, object]], ...] = (
+        ("visits", {}),
+        ("find_things", {}),
+        ("recap", {"start": BEGIN, "end": END}),
+    )
+    for tool, span in asks:
+        reply = asked(memory, tool, where=up, **span)
+        named = asked(memory, tool, where="bedroom", **span)
+        for key in ("total", "inside_s", "minutes"):
+            assert reply.get(key) == named.get(key), (tool, key)
+    assert asked(memory, "recap", where=up, start=BEGIN, end=END)["where"] == up
+    for heights in (2.0, [3.0], [3, 2], ["a", "b"]):
+        refused = asked(memory, "visits", where=plan | {"z": heights})
+        assert '"z": [2, 4]' in refused["detail"]
+
+
 def test_things_are_in_the_place_of_their_own_height(memory: Memory) -> None:
     def heights(**given: Any) -> list[float]:
         return sorted(row["place"]["z"] for row in asked(memory, "find_things", **given)["things"])
