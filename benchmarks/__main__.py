@@ -51,12 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         lines.append(line)
         print(report.row(line), flush=True)
     if given.json is not None:
-        told = {
-            "title": title,
-            "commit": report.commit(),
-            "lines": [line._asdict() for line in lines],
-        }
-        given.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        rows = [line._asdict() for line in lines]
+        table = {"title": title, "commit": report.commit(), "lines": rows}
+        given.json.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -9,7 +9,6 @@ message lies, is known beforehand and costs nothing.
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 import time
@@ -60,21 +59,17 @@ class Scan(NamedTuple):
 
 
 def bags_of(place: Path) -> list[Bag]:
-    """Returns a world's closed bags, oldest first; they are noted beside them."""
-    noted = place / "bags.json"
-    if not noted.is_file():
-        rows = []
-        for path in sorted((place / "bags").rglob("*.mcap")):
-            with path.open("rb") as stream:
-                try:
-                    summary = make_reader(stream).get_summary()
-                except McapError:
-                    continue  # the power failed
-            if summary is not None and summary.statistics is not None:
-                times = summary.statistics.message_start_time, summary.statistics.message_end_time
-                rows.append([str(path.relative_to(place)), *times])
-        noted.write_text(json.dumps(rows), encoding="utf-8")
-    found = [Bag(place / name, *times) for name, *times in json.loads(noted.read_bytes())]
+    """Returns a world's closed bags, oldest first."""
+    found = []
+    for path in (place / "bags").rglob("*.mcap"):
+        with path.open("rb") as stream:
+            try:
+                summary = make_reader(stream).get_summary()
+            except McapError:
+                continue  # the power failed
+        if summary is not None and summary.statistics is not None:
+            times = summary.statistics.message_start_time, summary.statistics.message_end_time
+            found.append(Bag(path, *times))
     return sorted(found, key=lambda bag: bag.start)
 
 

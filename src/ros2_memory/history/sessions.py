@@ -271,7 +271,7 @@ class Sessions:
         return children
 
     def _kinds(self, session: Session) -> frozenset[int]:
-        """Returns the positions in `_TransformSpans.kinds` of what a session holds."""
+        """Returns the positions in `_TransformSpans.kinds` of the kinds that a session has."""
         kinds = enumerate(self._spans.kinds)
         return frozenset(kind for kind, spans in kinds if session & spans.keys())
 

@@ -160,7 +160,7 @@ class _NodeRuns:
 class _TopicRuns:
     """Joins the blocks of one topic, the newest first, into runs.
 
-    Diagnostics of a node say nothing of what other nodes report: each has runs of its own.
+    Each node of diagnostics has runs of its own: its report does not end the error of another.
 
     Args:
         topic: its number.

@@ -103,7 +103,7 @@ class _Transaction(Transaction):
     """Makes the metadata of its table once after each update.
 
     pyiceberg makes it each time that it looks, thirty times a commit, and each time it copies all
-    versions of the table: half of what a commit takes.
+    versions of the table: half of the time of a commit.
     """
 
     _made: tuple[TableMetadata, tuple[TableUpdate, ...], TableMetadata] | None = None

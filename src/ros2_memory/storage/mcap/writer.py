@@ -181,7 +181,7 @@ class _Copy:
         source_bytes: the size of the other file.
 
     Attributes:
-        digest: of what was written.
+        digest: of the bytes that were written.
     """
 
     def __init__(self, stream: IO[bytes], source_bytes: int) -> None:
