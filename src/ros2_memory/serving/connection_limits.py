@@ -107,6 +107,7 @@ class BoundedConnection(H11Protocol):
     _deadline: asyncio.TimerHandle | None = None
     _unread: asyncio.TimerHandle | None = None
     _is_refused = False
+    _is_aborted = False
     _is_admitted = False
     _made_s = 0.0
 
@@ -134,11 +135,12 @@ class BoundedConnection(H11Protocol):
         transport.set_write_buffer_limits(high=0)
         _limit_socket(transport)
         self._made_s = self.loop.time()
-        unknown = self._unknown()
-        if len(self.connections) - len(unknown) >= MAX_CONNECTIONS:
-            self._log_refused("too many connections")
-            self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
-            return
+        present = [
+            connection
+            for connection in self.connections
+            if isinstance(connection, BoundedConnection) and not connection._is_aborted
+        ]
+        unknown = [connection for connection in present if connection.is_unknown]
         if len(unknown) > MAX_UNKNOWN:
             by_address = Counter(connection._address for connection in unknown)
 
@@ -146,21 +148,15 @@ class BoundedConnection(H11Protocol):
                 return -by_address[connection._address], connection._made_s
 
             min(unknown, key=rank)._abort()
+        if len(present) - len(unknown) >= MAX_CONNECTIONS:
+            self._log_refused("too many connections")
+            self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
+            return
         self._watch()
 
     @property
     def _address(self) -> str:
         return self.client[0] if self.client else ""
-
-    def _unknown(self) -> list[BoundedConnection]:
-        """Returns the open connections without an admitted request."""
-        return [
-            connection
-            for connection in self.connections
-            if isinstance(connection, BoundedConnection)
-            and connection.is_unknown
-            and not connection._is_refused
-        ]
 
     def _log_refused(self, reason: str) -> None:
         if refused := self._refusals.count(reason):
@@ -169,7 +165,7 @@ class BoundedConnection(H11Protocol):
     def _abort(self) -> None:
         """Closes the connection at once, without a reply."""
         self._log_refused("an unknown connection replaced by a newer one")
-        self._is_refused = True
+        self._is_aborted = True
         self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -243,7 +239,6 @@ class BoundedConnection(H11Protocol):
         """Handles bytes that are not HTTP."""
         self._log_refused("no HTTP")
         if self._has_begun() and self.cycle.response_started:
-            self._is_refused = True
             self.transport.abort()
         else:
             self._refuse(400, "Bad Request", f"{msg}\n")

@@ -241,6 +241,29 @@ async def test_a_flood_of_one_address_does_not_drop_who_speaks_late_from_another
         writer.close()
 
 
+@pytest.mark.parametrize("most_known", [3, 0])
+async def test_refused_connections_that_linger_take_no_place_of_admitted_ones(
+    monkeypatch: pytest.MonkeyPatch, most_known: int
+) -> None:
+    for name, most in (("MAX_UNKNOWN", 4), ("MAX_CONNECTIONS", most_known), ("LINGER_S", 3600.0)):
+        monkeypatch.setattr(connection_limits, name, most)
+    async with serving() as served:
+        with ExitStack() as stack:
+            for _ in range(20):
+                refused = stack.enter_context(socket.socket())
+                refused.bind(("127.0.0.2", 0))
+                refused.connect(("127.0.0.1", served.port))
+                refused.sendall(b"\x16\x03\x01\r\n\r\n")
+                with suppress(ConnectionResetError):
+                    assert b"HTTP/1.1 " in await asyncio.to_thread(refused.recv, 1000)
+            assert len(served.server.server_state.connections) <= 4
+            if most_known:
+                reader, writer = await served.connect()
+                writer.write(GET)
+                await answered(reader)
+                writer.close()
+
+
 CHUNKED = b"POST %b HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\n"
 
 
