@@ -288,6 +288,8 @@ UNPARSED = (
     call("get_position_at", DEEP, 51),
     b'{"method": "ping", "params": {"name": "\\ud800", "id": 7}, "jsonrpc": "2.0", "id": "a"}',
     b'{"jsonrpc": "2.0", "id": 52, "method": "tools/call", "params": [1]}',
+    b'{"jsonrpc": "2.0", "id": "\\ud800", "method": "ping"}',
+    b'{"jsonrpc": "2.0", "id": true, "method": 7}',
 )
 LAST = 99
 
@@ -332,7 +334,7 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
         if "content" in each.get("result", {})
     ]
     refused = {each["id"]: each["error"]["message"] for each in replies if "error" in each}
-    assert {50, 51, "a", 52} <= refused.keys()
+    assert {50, 51, "a", 52, None} <= refused.keys()
     assert "hex escape" in refused[50]
     assert "recursion limit" in refused[51]
     assert len(errors) >= 15

@@ -16,6 +16,8 @@ from mcp.shared.message import SessionMessage
 from mcp.types import INVALID_REQUEST, PARSE_ERROR, ErrorData, JSONRPCError
 from pydantic import ValidationError
 
+from ros2_memory.core.text import encodable
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
@@ -51,7 +53,7 @@ async def _relay(
 def error_reply(error: Exception) -> JSONRPCError | None:
     """Returns the reply to a line that is no message; None if the line is blank.
 
-    Its `id` is that of the request, or null if none is found.
+    Its `id` is that of the request, or null if there is none that JSON-RPC allows.
     """
     if not isinstance(error, ValidationError):
         return _error(None, INVALID_REQUEST, str(error))
@@ -67,7 +69,9 @@ def error_reply(error: Exception) -> JSONRPCError | None:
 
 
 def _error(request_id: object, code: int, reason: str) -> JSONRPCError:
-    number = request_id if isinstance(request_id, int | str) else None
+    number: int | str | None = None
+    if type(request_id) is int or (type(request_id) is str and encodable(request_id) == request_id):
+        number = request_id
     message = f"this is no JSON-RPC message: {reason}"
     return JSONRPCError(jsonrpc="2.0", id=number, error=ErrorData(code=code, message=message))
 
