@@ -210,6 +210,7 @@ def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
         (requested_box, "x0=0&y0=0&x1=1&y1=1", "give x0"),
         (requested_box, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
         (moment_of, "label=cup", "give t, or start and end"),
+        (moment_of, "start=1e10&end=2e10", "start must be a number of seconds"),
         (moment_of, f"t=1&label={'x' * 201}", "longer than"),
     ],
 )

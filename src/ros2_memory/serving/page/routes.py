@@ -33,6 +33,7 @@ from ros2_memory.serving.page.span import (
     stretch_shown,
 )
 from ros2_memory.serving.page.topics import MOST_SIGNALS, Signal, labels_shown, topics_shown
+from ros2_memory.tools.arguments import LATEST_UNIX_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -252,6 +253,6 @@ def _number(given: QueryParams, name: str, unit: str = "seconds") -> float | Non
         number = float(text)
     except ValueError:
         number = math.nan
-    if not math.isfinite(number):
+    if not abs(number) <= LATEST_UNIX_S:  # NaN neither
         raise InvalidArgumentsError(f"{name} must be a number of {unit}, not {text[:40]!r}")
     return number
