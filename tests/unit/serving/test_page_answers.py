@@ -330,6 +330,15 @@ def test_every_message_is_counted_when_it_was_also_where_bags_have_many(
     assert silent["spoke"] == [0] * 60 or not most_times
 
 
+def test_topics_are_listed_also_where_there_is_no_time_to_read_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.page.topics._QUICK_S", 0.0)
+    write_splits(tmp_path, [boolean(BEGIN + n * S, True) for n in range(600)], 600)
+    [row] = topics(memory_of(tmp_path), f"start={BEGIN_S}&end={BEGIN_S + 60}")["topics"]
+    assert (row["numbers"], set(row["spoke"])) == ([], {1})
+
+
 def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
     """Whatever time is looked at, the origin is the same."""
     messages = [fix(BEGIN + n * S, n * 1e-5, n * 1e-5) for n in range(20)]

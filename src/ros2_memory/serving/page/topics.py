@@ -209,21 +209,20 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
 
     In a row `spoke` counts the messages in each of `BINS` bins of the window; if time runs out,
     they count as spread evenly over their bags. `numbers` are the fields of the newest message that
-    can be plotted.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
+    can be plotted; none if time ran out before it was read.
     """
     view = View(memory, call.within(_QUICK_S), window.stop)
     topics = view.timeline.topics()
+    # Before the counts, which may take all the time.
+    numbers = {topic: _plottable_fields(view, topic) for topic in topics[:MOST_TOPICS]}
     return {
-        "topics": [_topic_row(view, topic, window) for topic in topics[:MOST_TOPICS]],
+        "topics": [_topic_row(view, topic, window, numbers[topic]) for topic in numbers],
         "topics_total": len(topics),
         "places_robot": _places_robot(view),
     }
 
 
-def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
+def _topic_row(view: View, topic: str, window: TimeWindow, numbers: Sequence[str]) -> JsonObject:
     """Returns a topic's row, with the type under which it was recorded last."""
     by_type = view.census(topic)
     newest_type = max(by_type, key=lambda type_name: by_type[type_name].last)
@@ -233,7 +232,7 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
         "count": by_type[newest_type].messages,
         "rate_hz": usual_rate(view.snapshot, topic, view.limits.latching),
         "spoke": _count_in_bins(view, topic, window).tolist(),
-        "numbers": [*_plottable_fields(view, topic)],
+        "numbers": [*numbers],
     }
 
 
@@ -259,12 +258,13 @@ def _count_in_bins(view: View, topic: str, window: TimeWindow) -> Ints:
 
 
 def _plottable_fields(view: View, topic: str) -> list[str]:
-    """Returns the dot-paths of the numbers in a topic's newest message."""
-    newest = view.stream.last(topic)
-    if newest is None or len(newest.record.payload) > _LARGEST_BYTES:
-        return []
-    message = view.bags.decode(newest)
-    if message is None:
+    """Returns the dot-paths of the numbers in a topic's newest message, if there is time for it."""
+    newest = message = None
+    with suppress(QueryTimeoutError):
+        newest = view.stream.last(topic)
+        if newest is not None and len(newest.record.payload) <= _LARGEST_BYTES:
+            message = view.bags.decode(newest)
+    if newest is None or message is None:
         return []
     value = view.extractor.exact(message, newest.type)
     paths = [path or "data" for path, kind in fields_of(value) if kind in _PLOTTED]
