@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
+from structlog.testing import capture_logs
 
 from ros2_memory.analysis import topic_events
 from ros2_memory.columns.fill import Progress
@@ -245,8 +246,11 @@ def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
 
 @pytest.mark.parametrize("name", ["rec_9", "rec", "", ".", "../page0", "rec_1/..", "rec_1/x"])
 def test_a_recording_of_another_name_is_refused(memory: Memory, name: str) -> None:
-    with pytest.raises(InvalidArgumentsError, match="no recording is named"):
+    memory.index.snapshot()
+    refused = pytest.raises(InvalidArgumentsError, match="no recording is named")
+    with capture_logs() as logged, refused:
         Recordings(memory).alone(name)
+    assert logged == []
 
 
 def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory.bag_dir.layout import is_kept_apart
@@ -12,7 +12,7 @@ from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened, similar
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.robots import ADVICE, describe_mixed
-from ros2_memory.index.recordings import name_of, recordings_of
+from ros2_memory.index.recordings import name_of, paths_named, recordings_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Recordings:
 
     def __init__(self, memory: Memory) -> None:
         self._memory = memory
-        self._memory_of = lru_cache(_MOST_MEMORIES)(partial(_memory_of, memory))
+        self._memory_of = lru_cache(_MOST_MEMORIES)(self._find)
 
     def alone(self, name: str) -> Memory:
         """Returns the memory of one recording, or of the recordings in one folder.
@@ -42,13 +42,23 @@ class Recordings:
         Raises:
             InvalidArgumentsError: there is no recording or folder of this name.
         """
-        alone = self._memory_of(name)
-        snapshot = alone.index.snapshot()
-        if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
+        return self._memory_of(name)
+
+    def _find(self, name: str) -> Memory:
+        """Returns the memory of a recording, as `alone`: its ages count from its newest message.
+
+        It has neither a recorder nor a budget.
+        """
+        index = cast("IndexManager", self._memory.index)  # a page is of one bag directory
+        snapshot = index.snapshot()
+        is_named = paths_named(f"{index.bag_dir}/{name.strip('/')}").fullmatch
+        aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
+        if not any(is_named(str(file.path)) for file in (*snapshot.bags, *aside)):
             near = similar(name, [str(row["name"]) for row in self._list()])
             hint = f"; similar: {', '.join(near)}" if near else ""
             raise InvalidArgumentsError(f"no recording is named {shortened(name)}{hint}")
-        return alone
+        limits = replace(self._memory.limits, now="latest", kept=None, recording=name)
+        return replace(self._memory, index=index.alone(name), limits=limits, memo=Memo())
 
     def shown(self, chosen: Memory, call: Call) -> JsonObject:
         """Returns the recordings, newest first, and notes on mixed robots in the chosen memory."""
@@ -62,16 +72,6 @@ class Recordings:
     def _list(self) -> list[JsonObject]:
         index = self._memory.index
         return _rows(index.published or index.snapshot(), str(index.bag_dir))
-
-
-def _memory_of(memory: Memory, name: str) -> Memory:
-    """Returns a memory of one recording: its ages count from its newest message.
-
-    It has neither a recorder nor a budget.
-    """
-    index = cast("IndexManager", memory.index)  # a page is of one bag directory
-    limits = replace(memory.limits, now="latest", kept=None, recording=name)
-    return replace(memory, index=index.alone(name), limits=limits, memo=Memo())
 
 
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
