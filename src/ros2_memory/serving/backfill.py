@@ -24,7 +24,7 @@ from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import Ns, ns_from_unix
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
@@ -84,7 +84,8 @@ class Backfill:
     _pruned_s: float = -math.inf
     _gone_after_prune: int = 0
     """Stored bags that `prune` left, although they cannot be read or have changed."""
-    _is_precomputed: bool = False
+    _precomputed_of: int | None = None
+    """How many bags were closed when `precompute` was last called."""
 
     async def fill(self) -> None:
         """Stores the closed bags of the moment. Raises nothing but cancellation."""
@@ -106,9 +107,10 @@ class Backfill:
             await in_thread(store.write_again)  # whether the disk works again
         stored = await self._store_batches(batches)
         await in_thread(self.follow)
-        if (stored or not self._is_precomputed) and len(waiting) <= BACKLOG:
+        closed = (await in_thread(self.progress)).closed
+        if (stored or closed != self._precomputed_of) and len(waiting) <= BACKLOG:
             await in_thread(self.precompute)
-            self._is_precomputed = True
+            self._precomputed_of = closed
         if is_prune_due or await in_thread(self.has_many_gone):
             await in_thread(self.prune)
         if is_prune_due:
@@ -147,7 +149,7 @@ class Backfill:
         """Returns how much is stored."""
         timeline = self.memory.snapshot().timeline
         if self.filling is None:
-            return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
+            return Progress(timeline.closed)
         return self.filling.progress(timeline)
 
     def _with_store(self, work: Callable[[Filling, Timeline], T], otherwise: T) -> T:

@@ -23,7 +23,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, boolean, detections, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 
@@ -187,3 +187,15 @@ async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
     backfill.filling.store.refusals, backfill.filling.store.refused_for = 2, "too large"
     reply = await Health(memory, backfill)()
     assert reply["store_refusals"] == {"count": 2, "reason": "too large"}
+
+
+async def test_without_a_store_health_names_topics_that_cannot_be_decoded_as_bags_come(
+    tmp_path: Path,
+) -> None:
+    memory = memory_of(tmp_path)
+    backfill = Backfill(memory, None)
+    await backfill.fill()
+    write_mcap(tmp_path / "a.mcap", [detections(T0, ["cup"])], McapLayout(definitions=False))
+    memory.index.refresh()
+    await backfill.fill()
+    assert len(backfill.undecodable) == 1
