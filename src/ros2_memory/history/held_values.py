@@ -15,7 +15,7 @@ import json
 import math
 from bisect import bisect_left, bisect_right
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -33,15 +33,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import (
-    ABSENT,
-    Summary,
-    descend,
-    names_beside,
-    names_others,
-    single_values,
-)
-from ros2_memory.messages.detections import parsed_json
+from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -147,23 +139,16 @@ class HeldValues:
         self._require_single_value(asked, until)
 
     def _require_single_value(self, asked: str, until: Ns) -> None:
-        window = TimeWindow(MIN_NS, until)
-        messages = self._view.stream.messages([self._topic], window, newest_first=True)
-        stated = self._stated(islice(messages, _MOST_TRIED))
-        # An empty text, which only ends a value, says nothing of the keys of others; and not each
-        # text of JSON has all keys.
-        said = (pair for pair in stated if pair[1] != "")
-        newest, value = next(said, (None, None))
-        if newest is not None and value is None and newest.type == TEXT:
-            newest, value = next((pair for pair in said if pair[1] is not None), (newest, None))
+        newest, value = self._newest_stated(until)
         if newest is None:
             names = self._field and names_without(self._view, self._topic, self._field, until)
             if self._field and names:
                 raise InvalidArgumentsError(f"{asked}: {unnamed(self._topic, self._field, names)}")
         elif value is None and self._field is not None:
             # Null is a value, as behind the end of a list, unless there is no such field.
-            message = self._view.bags.decode(newest)
-            self._view.extractor.shown(message, newest.type, [self._field])
+            if not self._is_in(newest):
+                message = self._view.bags.decode(newest)
+                self._view.extractor.shown(message, newest.type, [self._field])
         elif isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             how = f"as {self._topic}.FIELD" if asked == "with" else "where the tool takes fields"
@@ -176,6 +161,26 @@ class HeldValues:
                 f"boolean, which holds until the next one: {advice}"
             )
 
+    def _newest_stated(self, until: Ns) -> tuple[StoredMessage | None, JsonValue]:
+        """Returns the newest message before a moment that says something of the field, with that.
+
+        An empty text, which only ends a value, says nothing of the keys of others; and not each
+        text of JSON has all keys.
+        """
+        window = TimeWindow(MIN_NS, until)
+        messages = self._view.stream.messages([self._topic], window, newest_first=True)
+        stated = self._stated(islice(messages, _MOST_TRIED))
+        said = (pair for pair in stated if pair[1] != "")
+        newest, value = next(said, (None, None))
+        if newest is not None and value is None and newest.type == TEXT and not self._is_in(newest):
+            return next((pair for pair in said if self._is_in(pair[0])), (newest, value))
+        return newest, value
+
+    def _is_in(self, stored: StoredMessage) -> bool:
+        """Returns whether the value of a message has the field, be it null."""
+        path = self._view.extractor.own_path(self._field or "", stored.type)
+        return bool(at_field(self._view.value(stored), path))
+
     def _fields_in(self, value: JsonValue) -> str:
         """Returns the end of a sentence: fields of an object that hold a value; or nothing."""
         names = [name for name, _ in single_values(value, self._field or "")]
@@ -184,7 +189,8 @@ class HeldValues:
     def _advice_on_element(self, stored: StoredMessage) -> str:
         """Returns which single value to ask for if the field leads through a list; else nothing."""
         value = self._view.example(stored)
-        path = [] if self._field is None else self._field.split(".")
+        own = self._field and self._view.extractor.own_path(self._field, stored.type)
+        path = own.split(".") if own else []
         for nth in range(1, len(path) + 1):
             of_first = ".".join((*path[:nth], "0", *path[nth:]))
             found = at_field(value, of_first)
@@ -356,8 +362,9 @@ class HeldValues:
         for nth in range(1, len(segments) if value is None else 0):
             text = self._view.extractor.exact_at(message, type_name, ".".join(segments[:nth]))
             if isinstance(text, str):
-                inner = descend(parsed_json(text), segments[nth:]) if text.strip() else text
-                return None if inner is ABSENT else cast("JsonValue", inner)
+                rest = ".".join(segments[nth:])
+                found: list[JsonValue] = at_field(text, rest) if text.strip() else [text]
+                return found[0] if len(found) == 1 else found or None
         return value
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:

@@ -458,6 +458,31 @@ def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> Non
         assert [change["value"] for change in changes] == [None, "lost", None]
 
 
+@pytest.mark.parametrize(
+    ("said", "path", "values"),
+    [
+        ([{"in": '{"is": "on"}'}, {"in": '{"is": "off"}'}], "data.in.is", ["on", "off"]),
+        (
+            [{"tasks": [{"is": "new"}]}, {"tasks": [1, {"is": "end"}]}],
+            "data.tasks.-1.is",
+            ["new", "end"],
+        ),
+        ([{"tasks": [{"is": "new"}]}, {"tasks": [{"is": "end"}]}], "data.tasks.is", ["new", "end"]),
+        ([{"at": {"x": 1, "y": 2, "z": 0}}, {"at": {"x": 3, "y": 2, "z": 0}}], "data.at.0", [1, 3]),
+        ([{"error": None}, {"id": "D1"}], "data.error", [None]),
+    ],
+    ids=["text of JSON in it", "last element", "only element", "axis", "null"],
+)
+def test_what_a_condition_finds_in_a_text_of_json_has_a_length(
+    tmp_path: Path, said: list[object], path: str, values: list[object]
+) -> None:
+    reports = [text((T + 10 * at) * S, json.dumps(report)) for at, report in enumerate(said)]
+    memory = remembered(tmp_path, reports)
+    window = {"topic": "/chatter", "start": T, "end": T + 59}
+    reply = asked(memory, "get_topic_in_range", changes=True, fields=[path], **window)
+    assert [change["value"] for change in reply["changes"]] == values
+
+
 def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
     """0.1 + 0.2 is another float than 0.3: 0.3 had two rows, and changed to 0.3."""
     kind, shown = "std_msgs/msg/Float64", [0.3, 0.1 + 0.2, 0.3, 0.5]
