@@ -52,7 +52,7 @@ from ros2_memory.history.held_values import (
     is_latched,
     is_text,
 )
-from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
+from ros2_memory.history.no_data import matching_topics, no_value_between, require_recorded
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
@@ -469,7 +469,7 @@ def count_values(
     stop = end + 1
     held_values, start = _held_since(view, values, start, stop)
     if not held_values:
-        raise no_data_between(view, (topic,), asked)
+        raise no_value_between(view, topic, field, asked)
     view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held_values}))
     outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
     named_rows = _value_rows(held_values, view.elapsed_in(asked), united(outside), condition)

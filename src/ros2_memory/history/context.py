@@ -413,6 +413,9 @@ class Note(NamedTuple):
     until: Ns = MAX_NS
 
 
+UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
+
+
 class Notes:
     """Collects notes, each once.
 

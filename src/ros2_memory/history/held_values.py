@@ -6,14 +6,15 @@ known:
 
 - where another run of the recorder begins, unless the topic is latched;
 - after its last message, if the topic is usually frequent and falls silent for `SILENCE_NS`;
-- where messages of the topic were deleted.
+- where messages of the topic were deleted;
+- where a message cannot be decoded, which may say another one.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -24,13 +25,13 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.columns.shown import words_of
 from ros2_memory.columns.table import Texts, joined_texts
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.text import listed, repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
-from ros2_memory.history.context import READING_S
+from ros2_memory.history.context import READING_S, UNDECODED, Note
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
 from ros2_memory.history.scan import blocks, of_columns, scan
 from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
@@ -133,6 +134,7 @@ class HeldValues:
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
         self._breaks = breaks_of(view, topic)
+        self._undecoded: dict[Ns, Note] = {}  # by log time, which is one of the breaks
         self._reading = view.call.partial_after(READING_S)
         self.complete_since: Ns = MAX_NS
         self.known: list[HeldValue] = []
@@ -213,6 +215,8 @@ class HeldValues:
                 # Only the newest run can go on after `until`.
                 run, following = run._replace(last=following.last), next(later, None)
             stop, ended = self._end_of(run, following)
+            if not ended and stop in self._undecoded:
+                self._view.notes.add_lack(self._undecoded[stop])
             self.complete_since = run.first
             yield HeldValue(run.word, run.first, stop, ended)
             following = run
@@ -334,13 +338,26 @@ class HeldValues:
         Those say nothing of the field.
         """
         extractor, field = self._view.extractor, self._field
-        for stored, message in self._view.bags.decoded(messages):
+        failures: list[UndecodableError] = []
+        for stored in messages:
+            message = self._view.bags.decode(stored, failures)
+            if failures:
+                self._break_at(stored, failures.pop().reason)
+            if message is None:
+                continue
             value = self._value_of(message, stored.type)
             if value is None and field is not None:
                 path = extractor.own_path(field, stored.type)
                 if names_others(extractor.exact(message, stored.type), path):
                     continue
             yield stored, value
+
+    def _break_at(self, stored: StoredMessage, why: str) -> None:
+        """Ends what held before a message that cannot be decoded."""
+        at = stored.time
+        if at not in self._undecoded:
+            insort(self._breaks, at)
+            self._undecoded[at] = Note(UNDECODED, stored.topic, why, at, at)
 
     def _value_of(self, message: object, type_name: str) -> JsonValue:
         """Returns the value in a message; an object with one key stands for its value."""

@@ -478,6 +478,20 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
+def no_value_between(view: View, topic: str, field: str | None, window: TimeWindow) -> NoDataError:
+    """Returns the error for a window in which a topic, or a field of it, had no value."""
+    newest = view.stream.newest(topic, window)
+    if newest is None:
+        return no_data_between(view, (topic,), window)
+    try:
+        require_decoded(view, newest)
+    except NoDataError as error:
+        return with_notes(view, window, error)
+    start, end = map(unix_text, window.asked())
+    detail = f"no message of {topic} between {start} and {end} has {field or 'a value'}"
+    return with_notes(view, window, NoDataError(NoDataReason.GAP, detail))
+
+
 def require_recorded(view: View, asked: TimeWindow) -> None:
     """Checks that some of a window was recorded: else "never" and "none" would be false.
 

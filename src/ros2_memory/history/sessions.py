@@ -29,9 +29,8 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.spans import enclosing
-from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, Ns, Span
-from ros2_memory.history.context import READING_S, Note
+from ros2_memory.history.context import READING_S, UNDECODED, Note
 from ros2_memory.history.scan import (
     joined_back,
     messages_of,
@@ -61,7 +60,6 @@ _MOST_DECODED: Final = 500
 """After so many messages with moving transforms, those of the newest lookup alone are kept."""
 _FEW_SESSIONS: Final = 4
 """After this many sessions, the static transforms of all are looked up at once."""
-_UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
 
 
 class _TransformSpans(NamedTuple):
@@ -542,7 +540,7 @@ def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterato
                 message = view.memory.reader.decode(stored.record)
                 transforms = view.extractor.transforms(message, stored.time, static=is_static)
             except UndecodableError as error:
-                view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
+                view.notes.add_lack(Note(UNDECODED, error.topic, error.reason))
                 continue
         yield from transforms
 

@@ -19,7 +19,7 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.condition_hints import names_of_numbers
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
 from ros2_memory.history.held_values import HeldValue, HeldValues, holds_on, is_latched, is_text
-from ros2_memory.history.no_data import no_data_between, resolve_topic
+from ros2_memory.history.no_data import no_value_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, open_span
@@ -261,7 +261,7 @@ def topic_changes(
             "rest, ask again with that as end"
         )
     if not held:
-        raise no_data_between(view, (topic,), window)
+        raise no_value_between(view, topic, field, window)
     view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held}))
     elapsed = view.elapsed_in(window)
     spells = [

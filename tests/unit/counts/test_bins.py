@@ -25,6 +25,7 @@ from tests.support.bags import (
     detected,
     detections,
     header,
+    in_order,
     log_entry,
     make,
     odom,
@@ -481,6 +482,23 @@ def test_what_a_condition_finds_in_a_text_of_json_has_a_length(
     window = {"topic": "/chatter", "start": T, "end": T + 59}
     reply = asked(memory, "get_topic_in_range", changes=True, fields=[path], **window)
     assert [change["value"] for change in reply["changes"]] == values
+
+
+@each_way
+def test_what_could_not_be_decoded_ends_what_was_known(tmp_path: Path, recalls: bool) -> None:
+    """b held for 20 s, though what was said meanwhile is not known, and nothing told so."""
+    torn = Msg("/chatter", "std_msgs/msg/String", (T + 20) * S, b"")
+    said = [text((T + at) * S, word) for at, word in ((0, "a"), (10, "b"), (30, "a"), (60, "c"))]
+    memory = remembered(tmp_path, in_order([*said, torn]), recalls=recalls)
+    ask = partial(asked, memory, "get_topic_in_range", topic="/chatter")
+    reply = ask(start=T, end=T + 59, by="value")
+    assert [row[:3] for row in reply["rows"]] == [["a", 2, 39.0], ["b", 1, 10.0]]
+    assert reply["notes"][0].startswith("messages of /chatter could not be decoded")
+    changes = ask(start=T, end=T + 40, changes=True)["changes"]
+    assert [change.get("ended", True) for change in changes] == [True, False, True]
+    assert "notes" not in ask(start=T + 40, end=T + 59, by="value")
+    assert ask(start=T + 18, end=T + 25, changes=True)["total"] == 1
+    assert ask(start=T + 20, end=T + 25, changes=True)["reason"] == "undecodable"
 
 
 def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
