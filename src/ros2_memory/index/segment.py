@@ -116,6 +116,11 @@ class Pace(NamedTuple):
     begin: Ns
     end: Ns
 
+    def __or__(self, other: Pace) -> Pace:
+        """Returns the pace in two recordings that are of one run."""
+        topic = self.topic | other.topic
+        return Pace(topic, min(self.begin, other.begin), max(self.end, other.end))
+
     @property
     def is_rare(self) -> bool:
         """Whether the topic has a message every `RARE_NS` or less often, as a map has.

@@ -72,6 +72,7 @@ class Timeline:
         self.segments = tuple(segments)
         self.memo = Memo()
         self._recordings: dict[str, dict[Path, Span]] = {}
+        self._paces: dict[str, dict[Path, Pace]] = {}
 
     @classmethod
     def of(cls, bags: Iterable[BagFile]) -> Timeline:
@@ -142,11 +143,10 @@ class Timeline:
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
         if topic not in self._recordings:
-            spans: dict[Path, Span] = {}
-            for segment in self.segments:
-                for path, totals in segment.recordings(topic).items():
-                    spans[path] = wider(spans.get(path), (totals.first, totals.last))
-            self._recordings[topic] = spans
+            paces = self.paces(topic).items()
+            self._recordings[topic] = {
+                path: (pace.topic.first, pace.topic.last) for path, pace in paces
+            }
         return self._recordings[topic]
 
     @cached_property
@@ -273,14 +273,27 @@ class Timeline:
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns the pace of a topic in a recording, which must hold the topic."""
-        folder = str(recording)
-        totals, spans = NO_TOTALS, list[Span]()
+        return self.paces(topic)[recording]
+
+    def paces(self, topic: str) -> dict[Path, Pace]:
+        """Returns the pace of a topic in each recording that holds it."""
+        if topic not in self._paces:
+            totals: dict[Path, TopicTotals] = {}
+            for segment in self.segments:
+                for path, more in segment.recordings(topic).items():
+                    totals[path] = totals.get(path, NO_TOTALS) | more
+            spans = self._folder_spans
+            self._paces[topic] = {path: Pace(totals[path], *spans[str(path)]) for path in totals}
+        return self._paces[topic]
+
+    @cached_property
+    def _folder_spans(self) -> dict[str, Span]:
+        """By folder, the first and the last log time of its bags."""
+        spans: dict[str, Span] = {}
         for segment in self.segments:
-            if folder in segment.bags.folders:
-                totals |= segment.recordings(topic).get(recording, NO_TOTALS)
-                of_folder = segment.folder_totals[folder]
-                spans.append((of_folder.first, of_folder.last))
-        return Pace(totals, *enclosing(spans))
+            for folder, totals in segment.folder_totals.items():
+                spans[folder] = wider(spans.get(folder), (totals.first, totals.last))
+        return spans
 
     @cached_property
     def silent(self) -> frozenset[str]:

@@ -10,6 +10,7 @@ import pytest
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Latching, Memory, QuerySettings
+from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
@@ -53,6 +54,32 @@ def at(memory: Memory, topic: str, when: int) -> Any:
     """The reply to a question for a moment."""
     asks = {"topic": topic, "timestamp": when / S}
     return asked(memory, "get_topic_at_time", **asks)
+
+
+def test_the_pace_of_a_topic_is_measured_in_all_recordings_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 1,500 recordings, which are ten days, each sighting measured all of them anew: 9 s."""
+    measured: list[str] = []
+    real = Segment.recordings
+
+    def recordings(segment: Segment, topic: str) -> dict[Path, TopicTotals]:
+        measured.append(topic)
+        return real(segment, topic)
+
+    monkeypatch.setattr(Segment, "recordings", recordings)
+    found = []
+    for many in (6, 30):
+        for number in range(many):
+            bumps = [boolean(T0 + (600 * number + at) * S, at == 60) for at in (0, 60, 120)]
+            write_mcap(tmp_path / f"{many}" / f"r{number}" / "r_0.mcap", bumps)
+        bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+        measured.clear()
+        window = {"start": T0 / S, "end": T0 / S + 600 * many}
+        reply = asked(memory_of(tmp_path / f"{many}"), "find_matches", **bumped, **window)
+        assert len(reply["sightings"]) == 5
+        found.append(len(measured))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize(
