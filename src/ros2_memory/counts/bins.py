@@ -38,7 +38,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import TEXT, held_times, holds_on, is_latched
+from ros2_memory.history.held_values import TEXT, held_times, is_latched
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.places.pose_frames import (
     known_track,
@@ -363,7 +363,7 @@ class BinnedWindow:
         # What was counted is answered also where no time is left for this.
         with suppress(QueryTimeoutError):
             for topic in topics:
-                if _states_hold_on(self.view, topic):
+                if _has_states(self.view, topic):
                     held = held_times(self.view, [topic], self.counted)
                     known = (TimeWindow(*span).intersect(self.counted) for span in held)
                     heard += [(part.start, part.stop) for part in known if not part.empty]
@@ -559,10 +559,10 @@ class BinnedWindow:
             self.view.notes.add(f"no rows for times in which nothing was recorded: {shown}")
 
 
-def _states_hold_on(view: View, topic: str) -> bool:
-    """Returns whether a topic states something that lasts through silence.
+def _has_states(view: View, topic: str) -> bool:
+    """Returns whether a topic states something that lasts through silence while it is rare.
 
-    It is latched, or rare and of texts or booleans. A number of a rare topic is measured anew.
+    It is latched, or of texts or booleans. A number of a rare topic is measured anew.
     """
     are_states = {TEXT, _BOOLEAN}.issuperset(view.timeline.types_of(topic))
-    return is_latched(view, topic) or (are_states and holds_on(view, [topic]))
+    return are_states or is_latched(view, topic)

@@ -29,7 +29,7 @@ from ros2_memory.analysis.topic_events import TopicEvents, joined_events, joined
 from ros2_memory.core.arrays import bounds_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, spans_of, united, without
+from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
 from ros2_memory.core.text import Quoted, counted, listed, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
@@ -47,6 +47,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.held_values import (
     HeldValue,
     HeldValues,
+    frequent_times,
     held_until,
     holds_on,
     is_latched,
@@ -375,8 +376,10 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
     None if it said nothing before that still held then.
     """
     view, (start, _) = binned.view, binned.counted.asked()
-    held = message_before(view, topic, start) if holds_on(view, [topic]) else None
-    value = None if held is None else view.value(held)
+    held = message_before(view, topic, start)
+    if held is None or not holds_on(view, topic, held.time):
+        return None
+    value = view.value(held)
     return None if value is None else condition.matches(value)
 
 
@@ -398,14 +401,16 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
 def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Spans:
     """Returns the silences of a topic in some spans; none, if what it says holds through them."""
     long = [span for span in spans if span.stop - span.start > SILENCE_NS]
-    if not long or holds_on(binned.view, (topic,)):
+    frequent = frequent_times(binned.view, topic)
+    if not long or not frequent:
         return []
     window = TimeWindow(long[0].start, long[-1].stop + 1)
     heard = heard_times(binned.view, (topic,), window)
     between = (
         (last - 1, min(first, window.stop))
         for (_, last), (first, _) in pairwise(heard)
-        if window.contains(last - 1)  # outside of the window not every message is heard
+        # Outside of the window not every message is heard.
+        if lies_inside(frequent, last - 1) and window.contains(last - 1)
     )
     # A thinned day has one message of a measurement a minute.
     return without(between, binned.view.timeline.thinned_times)

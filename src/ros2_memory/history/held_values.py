@@ -28,7 +28,7 @@ from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.spans import Spans, without
+from ros2_memory.core.spans import Spans, lies_inside, united, without
 from ros2_memory.core.text import listed, repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S, UNDECODED, Note
@@ -42,12 +42,16 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.bag_access import StoredMessage
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
+    from ros2_memory.index.segment import Pace
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
+_FREQUENT: Final[Key[dict[str, Spans]]] = Key()
+"""Of a timeline: by topic, the `frequent_times` of one that is not latched."""
 _MOST_TRIED: Final = 200
 """At most this many messages are read to find one that says something of the field."""
 _MOST_CHARS: Final = 16 << 20
@@ -132,7 +136,7 @@ class HeldValues:
         self._view = view
         self._topic = topic
         self._field = field
-        self._holds_on = is_text(view, topic) or holds_on(view, [topic])
+        self._frequent = [] if is_text(view, topic) else frequent_times(view, topic)
         self._breaks = breaks_of(view, topic)
         self._undecoded: dict[Ns, Note] = {}  # by log time, which is one of the breaks
         self._reading = view.call.partial_after(READING_S)
@@ -298,8 +302,8 @@ class HeldValues:
         times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
         breaks |= np.diff(np.searchsorted(self._breaks, times)) > 0
-        if not self._holds_on:
-            breaks |= np.diff(times) > SILENCE_NS
+        for nth in np.flatnonzero(np.diff(times) > SILENCE_NS).tolist() if self._frequent else ():
+            breaks[nth] |= lies_inside(self._frequent, int(times[nth]))
         firsts = np.append(0, np.flatnonzero(breaks) + 1)
         lasts = np.append(firsts[1:], times.size) - 1
         return [
@@ -391,7 +395,7 @@ class HeldValues:
     def _end_of(self, run: _Run, following: _Run | None) -> tuple[Ns, bool]:
         """Returns until when a run is known to hold, and whether the following run ends it."""
         next_first = MAX_NS if following is None else following.first
-        if not self._holds_on and next_first - run.last > SILENCE_NS:
+        if next_first - run.last > SILENCE_NS and lies_inside(self._frequent, run.last):
             return run.last, False
         nth = bisect_left(self._breaks, run.last)
         if nth < len(self._breaks) and self._breaks[nth] < next_first:
@@ -549,7 +553,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = Fal
     as something is recorded. On another topic it holds until the next message if that comes within
     `SILENCE_NS`, else it does not hold after `last`.
     """
-    if is_latched(view, topic) or (or_rare and holds_on(view, [topic])):
+    if is_latched(view, topic) or (or_rare and holds_on(view, topic, last)):
         ends = [end, view.snapshot.latest or end]
         ends += [moment for moment in breaks_of(view, topic) if moment >= last]
         following = view.stream.first([topic], TimeWindow(last + 1, end + 1))
@@ -582,14 +586,27 @@ def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
     )
 
 
-def holds_on(view: View, topics: Iterable[str]) -> bool:
-    """Returns whether messages of topics hold through silence: the topics are latched or rare."""
-    timeline = view.timeline
-    return all(
-        is_latched(view, topic)
-        or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))
-        for topic in topics
-    )
+def holds_on(view: View, topic: str, at: Ns) -> bool:
+    """Returns whether what a topic said at a log time holds through silence: see below."""
+    return not lies_inside(frequent_times(view, topic), at)
+
+
+def frequent_times(view: View, topic: str) -> Spans:
+    """Returns the times in which what a topic says does not hold through silence.
+
+    That are the sessions in which it is not rare; none, if it is latched. Another session decides
+    nothing: its driver may be another one, and it may be deleted.
+    """
+    known = view.timeline.memo.of(_FREQUENT, dict)
+    if topic not in known:
+        paces: dict[Session, Pace] = {}
+        for recording, pace in view.timeline.paces(topic).items():
+            session = view.sessions.session_of(recording)
+            paces[session] = paces.get(session, pace) | pace
+        known[topic] = united(
+            (pace.topic.first, pace.end + 1) for pace in paces.values() if not pace.is_rare
+        )
+    return [] if is_latched(view, topic) else known[topic]
 
 
 def ends_of_holding(view: View, topic: str) -> list[Ns]:
@@ -602,12 +619,15 @@ def ends_of_holding(view: View, topic: str) -> list[Ns]:
 
 
 def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:
-    """Returns when it is known what topics said whose messages hold on, without later windows.
+    """Returns when it is known what topics said while their messages hold on, up to a window's end.
 
     That is from their first message on, but not from a break to their next message.
     """
+    frequent = united(chain.from_iterable(frequent_times(view, topic) for topic in topics))
     recordings = (view.timeline.recordings(topic).values() for topic in topics)
-    first = min((first for first, _ in chain.from_iterable(recordings)), default=MAX_NS)
+    firsts = [first for first, _ in chain.from_iterable(recordings)]
+    if all(lies_inside(frequent, first) for first in firsts):
+        return []
     breaks = sorted(chain.from_iterable(ends_of_holding(view, topic) for topic in topics))
     unknown: Spans = []
     known_again = MIN_NS
@@ -616,4 +636,4 @@ def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans
             message = view.stream.first([*topics], TimeWindow(at + 1, window.stop))
             known_again = MAX_NS if message is None else message.time
             unknown.append((at, known_again))
-    return without([(first, MAX_NS)], unknown)
+    return without([(min(firsts), MAX_NS)], united([*unknown, *frequent]))

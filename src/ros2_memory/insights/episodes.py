@@ -69,14 +69,14 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
         return False
     # A view of its own: its notes are of values that may lie outside of the window.
     values = HeldValues(View(view.memory, view.call, view.reach), topics[0])
-    texts: list[str] = []
+    said: list[HeldValue] = []
     try:
         for held in islice(values.back(MAX_NS), _MOST_LOOKED_AT):
             if held.is_blank:
                 return True
             if len(held.word) > _LONGEST_STATE:
                 return False
-            texts.append(str(held.exact))
+            said.append(held)
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
@@ -86,9 +86,11 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
             "each message counts alone, and may have held for longer than duration_s"
         )
         return False
+    if not said:
+        return False
     # What a latched topic said holds in sightings, too, and a frequent topic repeats its state.
-    is_on_change = holds_on(view, topics) and not is_latched(view, topics[0])
-    return is_on_change and _name_states(texts)
+    is_on_change = holds_on(view, topics[0], said[0].start) and not is_latched(view, topics[0])
+    return is_on_change and _name_states([str(held.exact) for held in said])
 
 
 def _name_states(texts: Sequence[str]) -> bool:
@@ -97,7 +99,7 @@ def _name_states(texts: Sequence[str]) -> bool:
     What people say seldom does.
     """
     if all(map(_CONSTANT.fullmatch, texts)):
-        return bool(texts)
+        return True
     changes = [text for text, _ in groupby(texts)]
     return all(map(_NAME.fullmatch, texts)) and len(changes) >= 2 * len({*changes})
 

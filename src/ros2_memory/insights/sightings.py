@@ -202,7 +202,11 @@ def _select_rows(
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_latched_notes(view, search, scope.window))
     sightings = [row for row in selected.rows if isinstance(row, Sighting)]
-    of_moments = {row.topic for row in sightings if row.first == row.until}
+    of_moments = {
+        row.topic
+        for row in sightings
+        if row.first == row.until and holds_on(view, row.topic, row.first)
+    }
     view.notes.add(*_notes_on_moments(view, sorted(of_moments)))
     if condition.field is None:
         of_texts = (row for row in sightings if is_text(view, row.topic))
@@ -226,7 +230,7 @@ def _known_until(view: View, row: Sighting | Episode) -> Ns:
 
     A topic that repeats a state may have left it at any time after its last match.
     """
-    if isinstance(row, Episode) or not row.messages or holds_on(view, [row.topic]):
+    if isinstance(row, Episode) or not row.messages or holds_on(view, row.topic, row.last):
         return row.until
     return row.last + 1
 
@@ -448,7 +452,7 @@ def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
         what = "text" if is_text(view, topic) else "number"
         types = view.timeline.types_of(topic)
         is_plain = what == "text" or all(name.startswith(_NUMBERS) for name in types)
-        if is_plain and not is_latched(view, topic) and holds_on(view, [topic]):
+        if is_plain and not is_latched(view, topic):
             yield (
                 f"a {what} on {topic} counts for the moment in which it was said: changes, and by "
                 "value, of get_topic_in_range have for how long each held until the next one"
@@ -523,7 +527,7 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
     if view.timeline.is_log(run.topic):
         return last
     _, end = scope.window.asked()
-    may_hold = is_latched(view, run.topic) or (is_flag and holds_on(view, [run.topic]))
+    may_hold = is_latched(view, run.topic) or (is_flag and holds_on(view, run.topic, last))
     until = run.until
     if may_hold or (until == MAX_NS and scope.is_bounded):
         until = held_until(view, run.topic, last, end, or_rare=is_flag)
@@ -538,15 +542,16 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
 
 def _is_ended(view: View, run: Run, until: Ns) -> bool:
     """Returns whether a message ended a state at a log time, or it is of a moment alone."""
-    if view.timeline.is_log(run.topic) or _is_said_once(view, run.topic):
+    if view.timeline.is_log(run.topic) or _is_said_once(view, run):
         return True
     at = TimeWindow(until, until + 1)
     return until > run.last and view.stream.first([run.topic], at) is not None
 
 
-def _is_said_once(view: View, topic: str) -> bool:
-    """Returns whether a topic has rare texts, each of which counts for its moment."""
-    return is_text(view, topic) and not is_latched(view, topic) and holds_on(view, [topic])
+def _is_said_once(view: View, run: Run) -> bool:
+    """Returns whether a run is of rare texts, each of which counts for its moment."""
+    is_plain = is_text(view, run.topic) and not is_latched(view, run.topic)
+    return is_plain and holds_on(view, run.topic, run.last)
 
 
 def _sighting(

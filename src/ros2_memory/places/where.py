@@ -25,14 +25,19 @@ from ros2_memory.core.arrays import stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, Storey, contains
-from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
+from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import deletions, ends_of_holding, held_times, holds_on
+from ros2_memory.history.held_values import (
+    deletions,
+    ends_of_holding,
+    frequent_times,
+    held_times,
+)
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested, met_by_any
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -444,11 +449,15 @@ class _ConditionStates:
         if types_matching(view, topic) == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
-        self._holds_on = holds_on(view, self.search.topics)
-        break_times = ends_of_holding if self._holds_on else deletions
+        topics = self.search.topics
+        self._frequent = united(
+            chain.from_iterable(frequent_times(view, topic) for topic in topics)
+        )
         # After these log times it is not known what the topics say, until their next message.
+        ends = chain.from_iterable(ends_of_holding(view, topic) for topic in topics)
+        deleted = chain.from_iterable(deletions(view, topic) for topic in topics)
         self._breaks = sorted(
-            chain.from_iterable(break_times(view, topic) for topic in self.search.topics)
+            {*deleted, *(at for at in ends if not lies_inside(self._frequent, at))}
         )
         # The window that was read, the log times of its messages, and whether each met the
         # condition.
@@ -461,10 +470,10 @@ class _ConditionStates:
 
         What latched and rare topics said holds through silences; what others said does not.
         """
-        topics = self.search.topics
-        if self._holds_on:
-            return held_times(self._view, topics, window)
-        return heard_times(self._view, topics, window.widened(SILENCE_NS))
+        topics, around = self.search.topics, window.widened(SILENCE_NS)
+        is_frequent = overlaps_any(self._frequent, around.start, around.stop)
+        heard = heard_times(self._view, topics, around) if is_frequent else []
+        return united([*held_times(self._view, topics, window), *heard])
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message at a log time met the condition.
@@ -477,7 +486,7 @@ class _ConditionStates:
         if not count or not self._met[count - 1]:
             return False
         last = self._times[count - 1]
-        is_silent = not self._holds_on and time - last > SILENCE_NS
+        is_silent = time - last > SILENCE_NS and lies_inside(self._frequent, last)
         return not is_silent and self._break_after(last) >= time
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
@@ -486,7 +495,7 @@ class _ConditionStates:
             last = self._times[bisect_right(self._times, time) - 1]
             following = self._next_after(time, end)
             known_until = min(following, end)
-            if not self._holds_on and known_until - last > SILENCE_NS:
+            if known_until - last > SILENCE_NS and lies_inside(self._frequent, last):
                 return max(time, last)
             break_time = self._break_after(last)
             if break_time < known_until:

@@ -82,6 +82,42 @@ def test_the_pace_of_a_topic_is_measured_in_all_recordings_at_once(
     assert found[0] == found[1]
 
 
+@each_way
+def test_how_long_what_a_topic_says_holds_is_of_its_own_session(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A bumper whose driver once repeated its state: values of all later days held for 0 s, until
+    that day was deleted."""
+    day = 86_400
+
+    def bumps(day_number: int, period_s: float, hits: Collection[int]) -> list[Msg]:
+        begin = T0 + day_number * day * S
+        ticks = [boolean(begin + round(n * period_s * S), n in hits) for n in range(10)]
+        return in_order([*ticks, *drive(begin, begin + 600 * S)[::10]])
+
+    for number, (period_s, hits) in enumerate([(0.1, [4, 5]), (60, [2, 3, 7])]):
+        write_mcap(tmp_path / f"r{number}" / "r_0.mcap", bumps(number, period_s, hits))
+    start = T0 / S + day
+    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    asks: list[tuple[str, dict[str, object]]] = [
+        ("get_topic_in_range", {"topic": "/bumper", "changes": True}),
+        ("get_topic_in_range", {"topic": "/bumper", "by": "value"}),
+        ("find_matches", bumped),
+        ("find_matches", bumped | {"by": "hour"}),
+        ("find_matches", driven | {"while": bumped}),
+    ]
+
+    def replies() -> list[Any]:
+        memory = memory_of(tmp_path, recalls=recalls)
+        return [asked(memory, name, **given, start=start, end=start + 599) for name, given in asks]
+
+    changes, *rest = replies()
+    assert [change["seconds"] for change in changes["changes"]] == [120, 120, 180, 60, 110]
+    (tmp_path / "r0" / "r_0.mcap").unlink()
+    assert replies() == [changes, *rest]
+
+
 @pytest.mark.parametrize(
     ("latched_s", "drive_s", "holds"),
     [
