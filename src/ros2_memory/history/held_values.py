@@ -629,11 +629,16 @@ def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans
     if all(lies_inside(frequent, first) for first in firsts):
         return []
     breaks = sorted(chain.from_iterable(ends_of_holding(view, topic) for topic in topics))
+    bounds = [view.bounds(topic, window)[0] for topic in topics]
+    begins = np.append(np.sort(np.concatenate(bounds)), window.stop)
     unknown: Spans = []
     known_again = MIN_NS
     for at in breaks[max(bisect_right(breaks, window.start) - 1, 0) :]:
         if known_again <= at < window.stop:
-            message = view.stream.first([*topics], TimeWindow(at + 1, window.stop))
-            known_again = MAX_NS if message is None else message.time
+            # Bags that begin later need not be compared with the next one.
+            near = int(begins[np.searchsorted(begins, at, side="right")])
+            parts = TimeWindow(at + 1, near + 1), TimeWindow(near + 1, window.stop)
+            following = (view.stream.first([*topics], part) for part in parts if not part.empty)
+            known_again = next((message.time for message in following if message), MAX_NS)
             unknown.append((at, known_again))
     return without([(min(firsts), MAX_NS)], united([*unknown, *frequent]))
