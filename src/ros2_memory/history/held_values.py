@@ -564,14 +564,17 @@ def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = Fal
     return last if following is None else max(last, min(following.time, end))
 
 
-def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
-    """Returns the message of a latched topic that held at a moment; None on other topics."""
-    if not is_latched(view, topic):
+def held_at(view: View, topic: str, moment: Ns, *, or_rare: bool = False) -> StoredMessage | None:
+    """Returns the message of a latched topic, with `or_rare` of a rare one, that held at a moment.
+
+    None on other topics.
+    """
+    if not or_rare and not is_latched(view, topic):
         return None
     before = view.stream.last(topic, moment)
-    if before is None or any(before.time <= at < moment for at in breaks_of(view, topic)):
+    if before is None or not holds_on(view, topic, before.time):
         return None
-    return before
+    return None if any(before.time <= at < moment for at in breaks_of(view, topic)) else before
 
 
 def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:

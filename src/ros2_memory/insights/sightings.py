@@ -200,7 +200,7 @@ def _select_rows(
         return _select_episodes(view, topics[0], condition, scope, selection)
     search = ReverseSearch(view, pattern, condition)
     selected = _run_sightings(view, search, scope, selection)
-    view.notes.add(*_latched_notes(view, search, scope.window))
+    view.notes.add(*_notes_on_begin(view, search, scope.window))
     sightings = [row for row in selected.rows if isinstance(row, Sighting)]
     of_moments = {
         row.topic
@@ -437,9 +437,11 @@ def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
     return np.array([*spans], np.int64).reshape(-1, 3)
 
 
-def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
-    """Returns the last message of a latched topic before a moment, if it meets a condition."""
-    held = held_at(view, topic, moment)
+def met_before(
+    view: View, topic: str, condition: Condition, moment: Ns, *, or_rare: bool = False
+) -> StoredMessage | None:
+    """Returns the message that held at a moment, as `held_at` does, if it meets a condition."""
+    held = held_at(view, topic, moment, or_rare=or_rare)
     if held is None:
         return None
     for_type = condition.of_type(held.type, view.extractor)
@@ -496,10 +498,15 @@ def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> It
         )
 
 
-def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
-    """Yields a note for each latched topic whose value met the condition when the window began."""
+def _notes_on_begin(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
+    """Yields a note for each topic that met the condition when the window began.
+
+    That is a latched topic, or a rare one with a flag.
+    """
+    start, _ = window.asked()
+    is_flag = _is_flag(search.condition)
     for topic in search.topics:
-        before = met_before(view, topic, search.condition, window.asked()[0])
+        before = met_before(view, topic, search.condition, start, or_rare=is_flag)
         if before is not None:
             yield (
                 f"{topic} met this already when the window began: what it said at "

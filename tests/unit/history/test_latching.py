@@ -56,6 +56,27 @@ def at(memory: Memory, topic: str, when: int) -> Any:
     return asked(memory, "get_topic_at_time", **asks)
 
 
+@each_way
+def test_a_flag_that_holds_since_before_a_window_is_noted_as_a_latched_value_is(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A door that stood open all the time was never open by find_matches, though by hour it was."""
+    door = [boolean(T0 + at * S, at != 1500, "/door") for at in (100, 1500)]
+    write_mcap(tmp_path / "r" / "r_0.mcap", in_order([*door, *drive(T0, T0 + 1800 * S)[::10]]))
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def found(wanted: bool, begin: int) -> Any:
+        asks = {"topic": "/door", "condition_type": "equals", "value": wanted}
+        window = {"start": T0 / S + begin, "end": T0 / S + begin + 200}
+        return asked(memory, "find_matches", **asks, **window)
+
+    [note] = found(True, 300)["notes"]
+    since = f"{T0 / S + 100:.6f} holds until its next message"
+    assert note == f"/door met this already when the window began: what it said at {since}"
+    assert "notes" not in found(False, 300)
+    assert "notes" not in found(True, 1550)
+
+
 def test_the_pace_of_a_topic_is_measured_in_all_recordings_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
