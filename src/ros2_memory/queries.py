@@ -1018,7 +1018,7 @@ def _notes_on_never(
         *notes_on_never(view, sought, condition, window),
     )
     if notes or _may_be_elsewhere(view, topics, condition):
-        return (*notes, *compared_frames(view, topics, condition))
+        return (*notes, *compared_frames(view, topics, condition, window))
     return ()
 
 

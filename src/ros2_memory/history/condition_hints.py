@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.core.errors import BagError, InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.messages.conversions import constants_of_field
 from ros2_memory.messages.detections import detections_of
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Schema
 
@@ -144,11 +146,14 @@ def hint_on_constants(schema: Schema, field: str, word: str) -> str:
     return f", or one of {of_field}" if of_field else ""
 
 
-def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+def compared_frames(
+    view: View, topics: Sequence[str], condition: Condition, window: TimeWindow
+) -> tuple[str, ...]:
     """Returns a note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    named = [f"{', '.join(frames)} ({topic})" for topic, frames in position_frames(view, topics)]
+    frames_of = position_frames(view, topics, window)
+    named = [f"{', '.join(frames)} ({topic})" for topic, frames in frames_of]
     if not named:
         return ()
     axes = "x and y" if condition.test.z is None else "x, y and z"
@@ -159,7 +164,9 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     return (note,)
 
 
-def require_frame(view: View, topics: Sequence[str], condition: Condition) -> None:
+def require_frame(
+    view: View, topics: Sequence[str], condition: Condition, window: TimeWindow | None = None
+) -> None:
     """Checks that a topic has positions in the frame that `near_position` names, if it does.
 
     Raises:
@@ -168,7 +175,7 @@ def require_frame(view: View, topics: Sequence[str], condition: Condition) -> No
     asked = condition.test.frame_id if isinstance(condition.test, NearPosition) else None
     if not asked:
         return
-    for topic, frames in position_frames(view, topics):
+    for topic, frames in position_frames(view, topics, window):
         if asked.lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
@@ -176,24 +183,34 @@ def require_frame(view: View, topics: Sequence[str], condition: Condition) -> No
             )
 
 
-def position_frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Returns the topics that have positions, with the frames of these; reads the first few."""
-    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
-    return [(topic, of_topic) for topic, of_topic in frames if of_topic]
+def position_frames(
+    view: View, topics: Sequence[str], window: TimeWindow | None = None
+) -> list[tuple[str, list[str]]]:
+    """Returns the topics that have positions, with the frames of these; reads the first few.
+
+    They are those of the first and the last message (in a window): an update may rename a frame.
+    """
+    asked = window or TimeWindow.everything()
+    found: list[tuple[str, list[str]]] = []
+    for topic in topics[:_MOST_FRAMES]:
+        frames: set[str] = set()
+        with suppress(QueryTimeoutError):
+            for newest_first in (True, False):
+                stored = view.stream.first([topic], asked, newest_first=newest_first)
+                frames.update(_frames_in(view, stored))
+        if frames:
+            found.append((topic, sorted(frames)))
+    return found
 
 
-def _frames_of_newest(view: View, topic: str) -> list[str]:
-    """Returns the frames of the positions in a topic's newest message; none if unknown."""
-    try:
-        stored = view.stream.last(topic)
-    except QueryTimeoutError:
-        return []
+def _frames_in(view: View, stored: StoredMessage | None) -> Iterator[str]:
+    """Yields the frames of the positions in a message, if it can be decoded."""
     message = view.bags.decode(stored)
     if stored is None or message is None:
-        return []
+        return
     extractor, type_name = view.extractor, stored.type
     own_frame = extractor.frame(message)
     seen = detections_of(extractor.exact(message, type_name), own_frame)
     frames = {detection.frame_id for detection in seen if detection.place is not None}
     pose = extractor.pose(message, type_name)
-    return sorted(filter(None, frames or {own_frame if pose is None else pose.frame_id}))
+    yield from filter(None, frames or {own_frame if pose is None else pose.frame_id})

@@ -290,6 +290,12 @@ def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeW
 class ReverseSearch:
     """A search for a condition on the topics of a name or glob.
 
+    Args:
+        view: of the call.
+        pattern: the name or glob.
+        condition: the condition.
+        window: of log time, that all is searched in; None if it is not known.
+
     Attributes:
         topics: the recorded topics that match the name or glob.
         condition: the condition.
@@ -300,11 +306,13 @@ class ReverseSearch:
         NoDataError: there is no such topic.
     """
 
-    def __init__(self, view: View, pattern: str, condition: Condition) -> None:
+    def __init__(
+        self, view: View, pattern: str, condition: Condition, window: TimeWindow | None = None
+    ) -> None:
         self._view = view
         self.condition = condition
         self.topics = matching_topics(view, pattern)
-        require_frame(view, self.topics, condition)
+        require_frame(view, self.topics, condition, window)
         self.ruled_out = False
         self._test = RowCondition(view, condition)
         self._nodes = Nodes(view.extractor)

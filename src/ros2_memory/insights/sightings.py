@@ -128,7 +128,7 @@ def find_matches(
     note_unread(view, found.searched, nothing=is_never, search=True)
     if is_never:
         view.notes.add(*describe_unsearched(view, topics, found.searched))
-    view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
+    view.notes.add(*compared_frames(view, topics, condition, window), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if is_never:
@@ -198,7 +198,7 @@ def _select_rows(
     if says_episodes(view, topics):
         require_fields(view, topics[0], selection.fields, scope.window.stop)
         return _select_episodes(view, topics[0], condition, scope, selection)
-    search = ReverseSearch(view, pattern, condition)
+    search = ReverseSearch(view, pattern, condition, scope.window)
     selected = _run_sightings(view, search, scope, selection)
     view.notes.add(*_notes_on_begin(view, search, scope.window))
     sightings = [row for row in selected.rows if isinstance(row, Sighting)]
@@ -369,7 +369,7 @@ def read_sightings(view: View, pattern: str, condition: Condition, scope: Scope)
             found.since,
             f"more than {MOST_COUNTED:,} episodes" if is_full else "",
         )
-    spans = _run_spans(view, ReverseSearch(view, pattern, condition), scope)
+    spans = _run_spans(view, ReverseSearch(view, pattern, condition, scope.window), scope)
     first, last, _ = spans.spans.T
     if (first == last).any():
         view.notes.add(*_notes_on_moments(view, topics))

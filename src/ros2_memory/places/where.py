@@ -354,7 +354,8 @@ class Scope:
         """Notes on the frames in which the conditions compared positions."""
         searches = (state.search for state in self._states)
         notes = (
-            compared_frames(self._view, search.topics, search.condition) for search in searches
+            compared_frames(self._view, search.topics, search.condition, self.window)
+            for search in searches
         )
         return tuple(dict.fromkeys(chain(*notes)))
 

@@ -32,11 +32,14 @@ from tests.support.bags import (
     boolean,
     detections,
     diagnostics,
+    header,
     in_order,
     log_entry,
     make,
     octets,
     odom,
+    point,
+    quaternion,
     text,
     tf,
     transform,
@@ -151,6 +154,24 @@ def test_a_field_that_the_newest_json_lacks_is_searched_and_named(
     never = ask(field="data.stat", value="idle")
     assert never["total"] == 0
     assert "/state: its newest JSON has no value.stat, but value.state, value.n" in never["notes"]
+
+
+def test_a_frame_that_was_renamed_is_that_of_the_window(tmp_path: Path) -> None:
+    """A place in the map of an older day was refused, and one in its later frame was found."""
+    at_one = make("geometry_msgs/msg/Pose", position=point(1.0, 0.0), orientation=quaternion(0.0))
+    for begin, frame in ((BEGIN, "map"), (BEGIN + 900 * S, "odom")):
+        kind = "geometry_msgs/msg/PoseStamped"
+        stamped = make(kind, header=header(begin, frame), pose=at_one)
+        write_mcap(tmp_path / frame / f"{frame}_0.mcap", [Msg("/pose", kind, begin, stamped)])
+    memory = memory_of(tmp_path)
+    near = {"topic": "/pose", "condition_type": "near_position"}
+    for after_s, frame, other in ((0, "map", "odom"), (900, "odom", "map")):
+        begin_s = BEGIN / S + after_s
+        ask = partial(asked, memory, "find_matches", **near, start=begin_s - 5, end=begin_s + 5)
+        found = ask(value={"x": 1.0, "y": 0.0, "frame_id": frame})
+        assert found["total"] == 1
+        assert any(f"in {frame} (/pose)" in note for note in found["notes"])
+        assert "invalid" in ask(value={"x": 1.0, "y": 0.0, "frame_id": other})["error"]
 
 
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
