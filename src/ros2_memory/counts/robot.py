@@ -6,6 +6,7 @@ So the metres of all bins add up to the metres of the window.
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,9 +38,8 @@ from ros2_memory.places.pose_frames import (
     placed_times,
     places_in,
 )
-from ros2_memory.places.stays import Stay, stays_within
-from ros2_memory.places.visits import ConfirmedStays, asked_place
-from ros2_memory.places.where import known_track_for, note_other_frame, parse_where
+from ros2_memory.places.visits import ConfirmedStays, TrackedStay, asked_place
+from ros2_memory.places.where import Scope, counted_stays, note_other_frame, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Region
+    from ros2_memory.core.timebase import Span
+    from ros2_memory.history.conditions import Sought
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Bins
 
@@ -62,11 +64,12 @@ def count_path(
     *,
     topic: str | None = None,
     where: JsonValue = None,
+    during: Sequence[Sought] = (),
 ) -> Bins:
     """Returns how many metres the robot drove in each bin of a window, or only inside of `where`.
 
     With `by` "place" the places of `where` are the bins instead, and what was driven elsewhere is
-    counted, too.
+    counted, too. With `during` only what was driven while other topics met conditions counts.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position, there are too many
@@ -84,11 +87,14 @@ def count_path(
     binned.count_since(since)
     total_m = path.totals.distance_m
     edges = binned.bins.edges[1:-1]
-    if place_asked is not None and by != "place":
-        track = known_track_for(view, place_asked, binned.counted).track
-        inside = stays_within(track, place_asked.region, binned.counted)
+    region = None if by == "place" else place_asked
+    if region is not None or during:
+        scope = Scope(view, binned.counted, during=during)
+        stays = counted_stays(view, region, scope, (path.first, path.last))
+        inside = [*chain.from_iterable(stays)]
         total_m = totals_inside(path.line, inside).distance_m
         metres_before = _metres_before(path.line, inside, edges)
+        binned.add_unknown(scope.unknown)
     else:
         metres_before = path.line.metres_at(edges) if len(path.line) else np.zeros(len(edges))
     # Rounded to a micrometre: differences of sums may be off from 0 by less.
@@ -106,11 +112,11 @@ def count_path(
     return binned.answer()
 
 
-def _metres_before(line: Line, inside: Sequence[Stay], edges: Ints) -> NDArray[np.float64]:
-    """Returns how many metres were driven during the stays before each edge (ns)."""
+def _metres_before(line: Line, inside: Sequence[Span], edges: Ints) -> NDArray[np.float64]:
+    """Returns how many metres were driven in the spans before each edge (ns)."""
     metres = np.zeros(len(edges))
-    for stay in inside:
-        bounds = np.append(edges.clip(stay.start, stay.stop), stay.start)
+    for start, stop in inside:
+        bounds = np.append(edges.clip(start, stop), start)
         driven = line.metres_at(bounds)
         metres += driven[:-1] - driven[-1]
     return metres
@@ -127,11 +133,13 @@ def count_visits(
     frame_id: str | None = None,
     radius_m: float | None = None,
     span: TimeRange = ANY_TIME,
+    during: Sequence[Sought] = (),
 ) -> Bins:
     """Returns entries, exits and minutes in a place for each bin; without a place, in all named.
 
     The place is a circle around `x` and `y` (m), or `where`; being in any of several places counts.
-    With `by` "place" each of them is a bin. Column `placed_s` is how long it was known where the
+    With `by` "place" each of them is a bin. With `during` only what was while other topics met
+    conditions counts, as in `ConfirmedStays`. Column `placed_s` is how long it was known where the
     robot was, `unknown_s` how long it was not.
 
     Raises:
@@ -161,10 +169,11 @@ def count_visits(
     # A short gap ends no visit, but then nothing is recorded.
     binned.add_lengths("placed_s", "duration", without(placed_spans, united(binned.gaps)))
     unknown = unknown_times(view, binned.counted, placed_spans, WHEREABOUTS, mixed=mixed_spans)
-    binned.add_unknown(unknown)
+    scope = Scope(view, binned.counted, during=during)
+    binned.add_unknown(united([*unknown, *scope.unknown]))
     if place is not None and by != "place":
-        stays = _stays(view, placement.frame_id, place.region, window)
-        if not stays:
+        stays = _stays(view, placement.frame_id, place.region, window, scope)
+        if not stays and not during:
             advice = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, advice)
         _add_visits(binned, stays)
@@ -172,7 +181,7 @@ def count_visits(
     named = memory.limits.places if place is None else place.places(placement.frame_id)
     # Two places may have one name.
     named_stays = [
-        (place.name, _stays(view, place.frame_id, place.region, window))
+        (place.name, _stays(view, place.frame_id, place.region, window, scope))
         for place, _ in places_in(view, named, placement, window)
     ]
     if by == "place":
@@ -182,28 +191,32 @@ def count_visits(
     return binned.answer()
 
 
-def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Stay]:
+def _stays(
+    view: View, frame_id: str, region: Region, window: TimeWindow, scope: Scope
+) -> list[TrackedStay]:
     """Returns when robots were in a region, in order, as the tool `visits` counts them."""
-    return sorted(visit.inside for visit in ConfirmedStays(view, frame_id, region, window).visits)
+    return ConfirmedStays(view, frame_id, region, window, scope).visits[::-1]
 
 
-def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
+def _add_visits(binned: BinnedWindow, stays: Sequence[TrackedStay]) -> None:
     """Adds the columns of visits to one place."""
     entries = _entry_times(stays)
-    exits = np.array([stay.stop for stay in stays if stay.left], np.int64)
+    exits = np.array([stay.inside.stop for stay in stays if stay.inside.left], np.int64)
     binned.add_counts("entries", entries)
     binned.add_counts("exits", exits)
-    binned.add_lengths("minutes", "minutes", [stay.span for stay in stays])
+    binned.add_lengths("minutes", "minutes", _spans(stays))
     binned.add_first("first_entry", entries)
     binned.add_first("first_exit", exits)
     binned.usual = binned.usual_of(entries)
 
 
-def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Stay]]) -> None:
+def _add_visits_by_place(
+    binned: BinnedWindow, stays_of_places: Sequence[Sequence[TrackedStay]]
+) -> None:
     """Adds the columns of visits for bins of places; there are no visits to "(elsewhere)"."""
     entries = [len(_entry_times(stays)) for stays in stays_of_places]
-    exits = [len([stay for stay in stays if stay.left]) for stays in stays_of_places]
-    lengths = [binned.elapsed.among(stay.span for stay in stays) for stays in stays_of_places]
+    exits = [len([stay for stay in stays if stay.inside.left]) for stays in stays_of_places]
+    lengths = [binned.elapsed.among(_spans(stays)) for stays in stays_of_places]
     no_visits: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
     binned.add("entries", "count", [*entries, *no_visits], sum(entries))
     binned.add("exits", "count", [*exits, *no_visits], sum(exits))
@@ -211,7 +224,7 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
 
 
 def _add_visits_of_each(
-    binned: BinnedWindow, by: By, named_stays: Sequence[tuple[str, Sequence[Stay]]]
+    binned: BinnedWindow, by: By, named_stays: Sequence[tuple[str, Sequence[TrackedStay]]]
 ) -> None:
     """Adds entries and minutes of each named place.
 
@@ -226,8 +239,12 @@ def _add_visits_of_each(
         )
     for name, stays in named_stays:
         binned.add_counts(f"{name}.entries", _entry_times(stays))
-        binned.add_lengths(f"{name}.minutes", "minutes", [stay.span for stay in stays])
+        binned.add_lengths(f"{name}.minutes", "minutes", _spans(stays))
 
 
-def _entry_times(stays: Sequence[Stay]) -> Ints:
-    return np.array([stay.start for stay in stays if stay.entered], np.int64)
+def _entry_times(stays: Sequence[TrackedStay]) -> Ints:
+    return np.array([stay.inside.start for stay in stays if stay.inside.entered], np.int64)
+
+
+def _spans(stays: Sequence[TrackedStay]) -> list[Span]:
+    return [part for stay in stays for part in stay.parts]

@@ -356,7 +356,7 @@ def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
     path, driven, stays = drive.path, None, region_stays.stays
     if path is not None and path.poses:
-        driven = totals_inside(path.line, stays)
+        driven = totals_inside(path.line, [stay.span for stay in stays])
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,

@@ -1,4 +1,4 @@
-"""What the robot drove while it was inside of a region: metres, speed and the drawn way.
+"""What the robot drove inside of a region, or while topics met conditions: metres, speed, the way.
 
 The robot's track in the region's frame says when it was inside. The drawn path, each of whose
 vertices has a log time and the metres driven so far, says how far it drove meanwhile. So
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -40,8 +41,7 @@ from ros2_memory.places.pose_frames import (
     placed_waypoints,
 )
 from ros2_memory.places.robot_tracks import TrackReader
-from ros2_memory.places.stays import Stay, stays_within
-from ros2_memory.places.where import known_track_for, parse_where
+from ros2_memory.places.where import Scope, counted_stays, parse_where
 from ros2_memory.results import DrivenInside, FarthestPose
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.frames import Floats
     from ros2_memory.core.model import Vector3
+    from ros2_memory.history.conditions import Sought
     from ros2_memory.history.context import Call, Memory
 
 _FARTHEST_FROM: Final = "farthest_from"
@@ -70,19 +71,21 @@ def driven_inside(
     call: Call,
     span: TimeRange,
     *,
-    where: JsonValue,
+    where: JsonValue = None,
+    during: Sequence[Sought] = (),
     topic: str | None = None,
     frame_id: str | None = None,
     max_waypoints: int = MAX_WAYPOINTS,
     farthest: JsonValue = None,
 ) -> DrivenInside:
-    """Returns what the robot drove inside of a region in a window, by one pose topic.
+    """Returns what the robot drove in a window inside of a region, or while topics met conditions.
 
     Args:
         memory: the memory.
         call: the call.
         span: the window.
-        where: the region, as `parse_where` takes it.
+        where: the region, as `parse_where` takes it; None for all.
+        during: the conditions on other topics, all of which have to hold.
         topic: the topic of the poses; None for the robot's.
         frame_id: the frame of the waypoints; None for that of the poses.
         max_waypoints: how many waypoints to draw; 0 for none, 1 for the last alone.
@@ -90,26 +93,27 @@ def driven_inside(
 
     Raises:
         InvalidArgumentsError: the topic carries no position, or `where` is no region of a frame
-            that its poses can be placed in.
-        NoDataError: there are no poses in the window.
+            that its poses can be placed in, or nothing can meet a condition.
+        NoDataError: there are no poses in the window, or no topic of a condition.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    place = parse_where(memory.limits, where)
+    place = None if where is None else parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None or not path.poses:
         raise no_path(view, name, window)
     note_unrecorded(view, window)
-    track = known_track_for(view, place, window).track
-    stays = stays_within(track, place.region, window)
-    totals = totals_inside(path.line, stays)
+    scope = Scope(view, window, during=during)
+    stays = counted_stays(view, place, scope, (path.first, path.last))
+    spans = [*chain.from_iterable(stays)]
+    totals = totals_inside(path.line, spans)
     waypoints = tuple(
         _with_measured_heading(view, name, path.line, waypoint)
-        for waypoint in _way_inside(path.line, stays, max_waypoints)
+        for waypoint in _way_inside(path.line, spans, max_waypoints)
     )
-    spans = [stay.span for stay in stays]
-    duration = view.elapsed_in(window).among(spans)
+    elapsed = view.elapsed_in(window)
+    duration = elapsed.among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, path.frames[0], frame_id)
@@ -120,17 +124,18 @@ def driven_inside(
     return DrivenInside(
         name,
         frame_id or path.frames[0],
-        place.shown,
-        len(stays),
+        None if place is None else place.shown,
+        None if place is None else len(stays),
         duration,
-        stays[0].start if stays else None,
-        stays[-1].stop if stays else None,
+        spans[0][0] if spans else None,
+        spans[-1][1] if spans else None,
         totals.distance_m,
         average,
         # The highest speed over a second may be below the mean of a visit of about a second.
         None if average is None else max(totals.max_speed or 0.0, average),
         waypoints,
         away,
+        elapsed.among(scope.unknown),
         notes=view.notes.sentences(),
     )
 
@@ -138,19 +143,19 @@ def driven_inside(
 class InsideTotals(NamedTuple):
     """What was driven inside: metres, and the highest speed (m/s) over a second.
 
-    `max_speed` is None if no stay is long enough to measure one.
+    `max_speed` is None if no span is long enough to measure one.
     """
 
     distance_m: float
     max_speed: float | None
 
 
-def totals_inside(line: Line, stays: Sequence[Stay]) -> InsideTotals:
-    """Returns what was driven along a line during stays; time in which they overlap counts once."""
-    if not stays:
+def totals_inside(line: Line, spans: Sequence[Span]) -> InsideTotals:
+    """Returns what was driven along a line in spans; time in which they overlap counts once."""
+    if not spans:
         return InsideTotals(0.0, 0.0)
     distance_m, speeds = 0.0, []
-    for start, stop in united(stay.span for stay in stays):
+    for start, stop in united(spans):
         first_m, last_m = line.metres_at(np.array([start, stop])).tolist()
         distance_m += last_m - first_m
         max_speed = _max_speed(line, start, stop, last_m - first_m)
@@ -182,14 +187,14 @@ def _between(times: Ints, start: Ns, stop: Ns) -> Ints:
     return times[slice(*np.searchsorted(times, (start, stop)))]
 
 
-def _way_inside(line: Line, stays: Sequence[Stay], at_most: int) -> tuple[Waypoint, ...]:
-    """Returns the drawn way during stays, the first waypoint of each marked as a jump.
+def _way_inside(line: Line, spans: Sequence[Span], at_most: int) -> tuple[Waypoint, ...]:
+    """Returns the drawn way in spans, the first waypoint of each marked as a jump.
 
     `at_most` 0 asks for no waypoint, 1 for the last.
     """
-    if not stays:
+    if not spans:
         return ()
-    inside = stacked([_line_during(line, stay) for stay in stays])
+    inside = stacked([_line_during(line, *span) for span in spans])
     waypoints, _ = draw_waypoints(inside, max(at_most, _FEWEST_WAYPOINTS))
     return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
@@ -213,13 +218,13 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     return waypoint
 
 
-def _line_during(line: Line, stay: Stay) -> Line:
-    """Returns the part of a line during a stay. Its first vertex is marked as a jump."""
-    first = dataclasses.replace(line.at(np.array([stay.start])), jumps=np.array([True]))
-    if stay.stop == stay.start:
+def _line_during(line: Line, start: Ns, stop: Ns) -> Line:
+    """Returns the part of a line between two times. Its first vertex is marked as a jump."""
+    first = dataclasses.replace(line.at(np.array([start])), jumps=np.array([True]))
+    if stop == start:
         return first
-    inner = np.flatnonzero((line.times > stay.start) & (line.times < stay.stop))
-    return stacked([first, rows_of(line, inner), line.at(np.array([stay.stop]))])
+    inner = np.flatnonzero((line.times > start) & (line.times < stop))
+    return stacked([first, rows_of(line, inner), line.at(np.array([stop]))])
 
 
 def farthest_from(

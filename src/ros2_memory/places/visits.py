@@ -34,7 +34,7 @@ from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import ANY_TIME, TimeRange, View, open_search
+from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_search
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     WHEREABOUTS,
@@ -47,13 +47,14 @@ from ros2_memory.places.pose_frames import (
 )
 from ros2_memory.places.robot_tracks import Placed, TrackReader
 from ros2_memory.places.stays import Stay, stays
-from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
+from ros2_memory.places.where import Scope, Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import PlaceVisits, Visit, Visits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.core.arrays import Ints
+    from ros2_memory.history.conditions import Sought
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 _CURRENT_SPLITS: Final = 3
@@ -79,16 +80,18 @@ def visits(
     radius_m: float | None = None,
     span: TimeRange = ANY_TIME,
     limit: int = 10,
+    during: Sequence[Sought] = (),
 ) -> Visits:
     """Returns the visits to a place, newest first; without a place, a summary for each named one.
 
     The place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map
-    (the default) or the frame of the poses. `span` bounds the search.
+    (the default) or the frame of the poses. `span` bounds the search. With `during` visits count
+    as `ConfirmedStays` says, and nothing is said about now.
 
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the place is invalid, the frame
-            is another one, or the bounds are reversed.
-        NoDataError: nothing is recorded, or no poses.
+            is another one, the bounds are reversed, or nothing can meet a condition.
+        NoDataError: nothing is recorded, no poses, or no topic of a condition.
         QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where, frame_id)
@@ -97,9 +100,10 @@ def visits(
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
     placement = map_placement(view, topic, frame_id if place is None else place.frame_id)
+    scope = Scope(view, clamped(view, window), during=during)
     if place is None:
-        return _visits_of_places(view, window, placement, mixed, now)
-    confirmed = ConfirmedStays(view, placement.frame_id, place.region, window)
+        return _visits_of_places(view, window, placement, mixed, scope, now=now)
+    confirmed = ConfirmedStays(view, placement.frame_id, place.region, window, scope)
     newest = _newest_pose_time(view, topic, confirmed.known.track, window, now + FUTURE_NS)
     is_current = newest is not None and newest >= _oldest_current(view, now)
     shown = tuple(
@@ -108,7 +112,7 @@ def visits(
     )
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not confirmed.visits:
+    if not confirmed.visits and not during:
         advice = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, advice)
     view.notes.retract_outside(window)
@@ -126,8 +130,8 @@ def visits(
         exits=len(confirmed.exits),
         all_counted=confirmed.known.since is None,
         where=place.name,
-        unknown=_unknown(view, window, [confirmed.known.track], mixed),
-        is_current=is_current,
+        unknown=_unknown(view, window, [confirmed.known.track], mixed, scope),
+        is_current=is_current and not during,
         notes=view.notes.sentences(),
     )
 
@@ -143,11 +147,11 @@ def _oldest_current(view: View, now: Ns) -> Ns:
 
 
 def _visits_of_places(
-    view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, now: Ns
+    view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, scope: Scope, *, now: Ns
 ) -> Visits:
     """Returns how often and how long the robot was in each named place, the longest first."""
     stays_of_places = [
-        (place, ConfirmedStays(view, place.frame_id, place.region, window))
+        (place, ConfirmedStays(view, place.frame_id, place.region, window, scope))
         for place, _ in places_in(view, view.limits.places, placement, window)
     ]
     rows = (confirmed.summary(place.name) for place, confirmed in stays_of_places)
@@ -161,7 +165,7 @@ def _visits_of_places(
         total=sum(row.entries for row in places),
         now=now,
         places=places,
-        unknown=_unknown(view, window, tracks.values(), mixed),
+        unknown=_unknown(view, window, tracks.values(), mixed, scope),
         notes=view.notes.sentences(),
     )
 
@@ -221,13 +225,15 @@ def asked_place(
     return None
 
 
-def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans) -> Ns:
-    """Returns how long (ns) some track, of those in different frames, is not known."""
+def _unknown(
+    view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans, scope: Scope
+) -> Ns:
+    """Returns how long (ns) some track, of those in different frames, or the scope is not known."""
     spans = (
         unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS, mixed=mixed)
         for track in tracks
     )
-    return view.elapsed_in(window).among(united(chain.from_iterable(spans)))
+    return view.elapsed_in(window).among(united(chain(scope.unknown, *spans)))
 
 
 def _newest_pose_time(
@@ -284,17 +290,31 @@ class TrackedStay(NamedTuple):
         inside: the part of the visit in the window.
         whole: the whole visit.
         track: the robot's track.
+        parts: the parts of `inside` that count; both ends are inclusive.
     """
 
     inside: Stay
     whole: Stay
     track: RobotTrack
+    parts: Sequence[Span]
+
+    def counted_in(self, scope: Scope) -> TrackedStay:
+        """Returns the visit with the parts that lie in a scope, and its ends if they do."""
+        inside = self.inside
+        return self._replace(
+            inside=inside._replace(
+                entered=inside.entered and scope.holds_at(inside.start),
+                left=inside.left and scope.holds_at(inside.stop),
+            ),
+            parts=scope.parts_of(*inside.span),
+        )
 
 
 class ConfirmedStays:
-    """The visits to a region of a frame that overlap a window.
+    """The visits to a region of a frame that overlap a window, and some time of a scope.
 
-    Tracks show them. Those that are in doubt are confirmed by poses.
+    Tracks show them. Those that are in doubt are confirmed by poses. Of a visit only the time in
+    the scope counts, and its entry and its exit if they are in it.
 
     Attributes:
         known: the tracks of the robots.
@@ -302,7 +322,9 @@ class ConfirmedStays:
         elapsed: how much time passed between log times of the window.
     """
 
-    def __init__(self, view: View, frame_id: str, region: Region, window: TimeWindow) -> None:
+    def __init__(
+        self, view: View, frame_id: str, region: Region, window: TimeWindow, scope: Scope
+    ) -> None:
         """Finds the visits.
 
         Raises:
@@ -310,18 +332,20 @@ class ConfirmedStays:
         """
         self.known = known_track(view, frame_id, window)
         self.elapsed = view.elapsed_in(window)
-        self._region, self._window = region, window
+        self._region, self._window, self._scope = region, window, scope
         # A shown visit begins at one of the poses by which it was confirmed.
         self._poses = lru_cache(2 * _MOST_TRIED)(TrackReader(view, frame_id).poses)
         by_track = [
-            TrackedStay(stay.within(window), stay, track)
+            TrackedStay(stay.within(window), stay, track, ())
             for track in self.known.tracks
             for stay in self._without_false_exits(stays(track, region), track)
             if window.overlaps(stay.start, stay.stop)
         ]
         by_track.sort(key=lambda visit: visit.whole, reverse=True)
         self._looked_at = 0
-        self.visits = [visit for visit in map(self._confirmed, by_track) if visit is not None]
+        confirmed = map(self._confirmed, by_track)
+        in_scope = (visit.counted_in(scope) for visit in confirmed if visit is not None)
+        self.visits = [visit for visit in in_scope if visit.parts]
         if self._looked_at > _MOST_CONFIRMED:
             older = counted(self._looked_at - _MOST_CONFIRMED, "older visit")
             view.notes.add(
@@ -341,7 +365,7 @@ class ConfirmedStays:
     @property
     def duration(self) -> Ns:
         """How long (ns) all visits lasted together, by the tracks."""
-        return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.visits)
+        return self.elapsed.among(part for visit in self.visits for part in visit.parts)
 
     @property
     def of_first_robot(self) -> Spans:
@@ -365,7 +389,7 @@ class ConfirmedStays:
         Its times are log times of poses: the first and the last inside, and the closest to the
         middle. `newest` is the log time of the robot's newest pose, or None if that is too old.
         """
-        stay = self._between_poses(visit)
+        stay, scope = self._between_poses(visit), self._scope
         is_there = newest is not None and stay.start <= newest <= stay.stop and not stay.left
         closest_m, closest_at = None, None
         if isinstance(plan := plan_of(self._region), Circle):
@@ -373,7 +397,7 @@ class ConfirmedStays:
         return Visit(
             arrived=stay.start,
             departed=None if is_there else stay.stop,
-            duration=self.elapsed.between(stay.start, stay.stop),
+            duration=self.elapsed.among(scope.parts_of(*stay.span)),
             closest_m=closest_m,
             closest_at=closest_at,
             restarts=0,

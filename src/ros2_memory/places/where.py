@@ -30,7 +30,7 @@ from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of, types_matching
-from ros2_memory.history.coverage import span_text, unknown_times
+from ros2_memory.history.coverage import recording_gaps, span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import (
     deletions,
@@ -49,6 +49,7 @@ from ros2_memory.places.pose_frames import (
     placed_times,
 )
 from ros2_memory.places.robot_tracks import TrackReader
+from ros2_memory.places.stays import stays_within
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -401,6 +402,27 @@ class Scope:
         for state in self._states:
             parts = list(chain.from_iterable(state.parts_of(*part) for part in parts))
         return parts
+
+
+def counted_stays(view: View, where: Where | None, scope: Scope, path: Span) -> list[Spans]:
+    """Returns the parts of each of the robot's stays in a place that lie in a scope, in order.
+
+    Without a place all of its path, from the first to the last log time, is one stay, but for gaps
+    of the recording. Stays without such a part are left out; all ends are inclusive.
+
+    Raises:
+        InvalidArgumentsError, NoDataError, QueryTimeoutError: as `known_track_for` does.
+    """
+    window = scope.window
+    if where is None:
+        first, last = path
+        recorded = without([(first, last + 1)], united(recording_gaps(view, window)))
+        spans = [(start, stop - 1) for start, stop in recorded]
+    else:
+        track = known_track_for(view, where, window).track
+        spans = [stay.span for stay in stays_within(track, where.region, window)]
+    parts_of_stays = (scope.parts_of(*span) for span in spans)
+    return [parts for parts in parts_of_stays if parts]
 
 
 def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:

@@ -238,12 +238,13 @@ class TrajectorySummary(AnswerWithNotes):
 
 
 @result(
-    "where",
+    PLAIN("where").if_known,
     digits(4)("distance_m"),
     digits(4)("avg_speed"),
     digits(4)("max_speed"),
     SECONDS("duration_s"),
-    "visits",
+    PLAIN("visits").if_known,
+    SECONDS("unknown_s").if_any,
     TIME("start"),
     TIME("end"),
     LOCAL("local", "start", "end"),
@@ -254,27 +255,29 @@ class TrajectorySummary(AnswerWithNotes):
     span=("start", "end"),
 )
 class DrivenInside(AnswerWithNotes):
-    """The path driven inside a region in a window.
+    """The path driven in a window inside a region, or while topics met conditions.
 
     Attributes:
         topic: of the poses.
         frame_id: of the waypoints.
-        where: the name of the region, or its bounds.
-        visits: how often the robot was inside.
-        duration: for how long it was inside in all.
-        start: log time at which the first visit began; None without a visit.
-        end: log time at which the last visit ended; None without a visit.
-        distance_m: metres driven inside.
-        avg_speed: distance by duration (m/s); None if the robot was inside for one pose alone.
+        where: the name of the region, or its bounds; None if no region was asked about.
+        visits: how often the robot was inside while the conditions held; None without a region.
+        duration: for how long that was in all.
+        start: log time at which that first began; None if it never did.
+        end: log time at which that last ended; None if it never was.
+        distance_m: metres driven then.
+        avg_speed: distance by duration (m/s); None if that is of one pose alone.
         max_speed: over a second (m/s); None as for `avg_speed`.
-        waypoints: of the path inside; `jump` marks the first waypoint of a visit.
-        farthest: the pose inside that is farthest from a point; None if no point was asked about.
+        waypoints: of the path then; `jump` marks where a stretch of it begins.
+        farthest: the pose then that is farthest from a point; None if no point was asked about.
+        unknown: for how long it is not known, though something was recorded, whether the conditions
+            held.
     """
 
     topic: str
     frame_id: str
-    where: JsonValue
-    visits: int
+    where: JsonValue | None
+    visits: int | None
     duration: Ns
     start: Ns | None
     end: Ns | None
@@ -283,6 +286,7 @@ class DrivenInside(AnswerWithNotes):
     max_speed: float | None
     waypoints: tuple[Waypoint, ...]
     farthest: FarthestPose | None = None
+    unknown: Ns = 0
 
 
 @result(

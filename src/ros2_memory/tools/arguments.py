@@ -247,7 +247,7 @@ _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name
 _AtLeast0: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 _Tolerance: TypeAlias = Annotated[_AtLeast0, Field(description="Oldest age, s, e.g. 2 at 1 Hz.")]
-_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least.")]
+_MinScore: TypeAlias = _AtLeast0
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _UnixSeconds: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), AfterValidator(_check_unix)
@@ -333,12 +333,12 @@ _Between: TypeAlias = Annotated[
 _FrameId: TypeAlias = Annotated[_Name, Field(description="Of the reply.")]
 _Limit: TypeAlias = Annotated[
     int,
-    Field(strict=True, ge=1, le=100, description="Rows."),
+    Field(strict=True, ge=1, le=100),
     BeforeValidator(_as_integer),
 ]
 _ConditionType: TypeAlias = Annotated[
     Literal["contains", "contains_word", "equals", "above", "below", "near_position"],
-    Field(description="How to test.", examples=["contains"]),
+    Field(examples=["contains"]),
 ]
 _ConditionValue: TypeAlias = Annotated[
     JsonValue,
@@ -369,6 +369,29 @@ _ByInMatches: TypeAlias = Annotated[
     Field(
         description="Rows, local; place: of where, else named; value: that held; "
         'label: seen (value "" for all).'
+    ),
+]
+
+
+def _while(description: str) -> WithJsonSchema:
+    """Returns the schema of conditions on other topics."""
+    return WithJsonSchema(
+        {
+            "type": ["object", "array"],
+            "items": {"type": "object"},
+            "description": description,
+            "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],
+        }
+    )
+
+
+_Conditions: TypeAlias = Annotated[tuple[InstanceOf[Sought], ...], BeforeValidator(as_while)]
+_While: TypeAlias = Annotated[_Conditions, _while("Forms: trajectory_summary.")]
+_WhileInFull: TypeAlias = Annotated[
+    _Conditions,
+    _while(
+        "Only while a topic meets this, e.g. "
+        '{"topic": "/is_docked", "condition_type": "equals", "value": false}; of a list, all.'
     ),
 ]
 
@@ -530,7 +553,7 @@ class TopicRangeArguments(Arguments):
     span: TimeRange
     max_samples: Annotated[
         int,
-        Field(strict=True, ge=1, le=10_000, description="Rows."),
+        Field(strict=True, ge=1, le=10_000),
         BeforeValidator(_as_integer),
     ] = 100
     fields: _Fields = ()
@@ -607,6 +630,7 @@ class TrajectoryArguments(Arguments):
     ] = MAX_WAYPOINTS
     farthest: _Point | None = Field(default=None, alias="farthest_from")
     by: _By | None = None
+    during: _WhileInFull = Field(default=(), alias="while")
     between: _Between | None = None
 
 
@@ -669,7 +693,7 @@ class SelectArguments(Arguments):
     ] = None
     limit: Annotated[
         int,
-        Field(strict=True, ge=1, le=1000, description="Rows."),
+        Field(strict=True, ge=1, le=1000),
         BeforeValidator(_as_integer),
     ] = 100
 
@@ -682,25 +706,11 @@ class VisitsArguments(Arguments):
     where: _Where | None = None
     span: TimeRange
     frame_id: Annotated[_Name, Field(description="Of x, y; default: the map.")] | None = None
-    radius_m: Annotated[_Positive, Field(description="m.")] | None = None
+    radius_m: _Positive | None = None
     limit: _Limit = 10
     by: _By | None = None
+    during: _While = Field(default=(), alias="while")
     between: _Between | None = None
-
-
-_While: TypeAlias = Annotated[
-    tuple[InstanceOf[Sought], ...],
-    BeforeValidator(as_while),
-    WithJsonSchema(
-        {
-            "type": ["object", "array"],
-            "items": {"type": "object"},
-            "description": "Only while a topic meets this, e.g. "
-            '{"topic": "/is_docked", "condition_type": "equals", "value": false}; of a list, all.',
-            "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],
-        }
-    ),
-]
 
 
 class MatchesArguments(ConditionArguments):

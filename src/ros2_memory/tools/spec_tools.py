@@ -140,6 +140,6 @@ DECLARATIONS = (
         TrajectoryArguments,
         queries.trajectory_summary,
         blocking=True,
-        instead={"by": count_path, "where": driven_inside},
+        instead={"by": count_path, "where": driven_inside, "during": driven_inside},
     ),
 )

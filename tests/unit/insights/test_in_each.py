@@ -55,7 +55,7 @@ def memory(folder: Path) -> Memory:
 
 QUESTIONS: dict[str, dict[str, Any]] = {
     "find_matches": {**HELLO, "where": "hall", "limit": 100},
-    "visits": {"where": "kitchen", "limit": 100},
+    "visits": {"where": "kitchen", "limit": 100, "while": HELLO},
     "trajectory_summary": {"farthest_from": {"x": 0, "y": 0}},
     "recap": {"where": "kitchen"},
     "get_topic_in_range": {"topic": "/odom", "fields": ["position.x"], "by": "hour"},

@@ -175,6 +175,8 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
     *(("trajectory_summary", more) for more in (BOX, {**BOX, "frame_id": "map"})),
     *(("find_matches", {**CUPS, **more}) for more in ({}, {"where": "room"}, BOX)),
     ("find_matches", {**SAID, "while": UNDOCKED}),
+    *(("trajectory_summary", {"while": PRESSED, **more}) for more in ({}, BOX, {"by": "day"})),
+    *(("visits", {"while": UNDOCKED, "where": "start", **more}) for more in ({}, {"by": "day"})),
     ("visits", {}),
     *(("visits", more) for more in ({"where": "start"}, BOX, {**BOX, "frame_id": "odom"})),
     *(("visits", {"where": "start", "by": by}) for by in BINS),

@@ -297,5 +297,7 @@ def every_question(
     yield "find_things", {"label": label, "limit": 3}
     yield "visits", spot
     yield "visits", {**spot, "by": "hour"}
+    yield "visits", {**spot, **whole, "while": match}
+    yield "trajectory_summary", {**whole, "while": match}
     for tool in ("list_recorded_topics", "data_time_range", "list_frames"):
         yield tool, {}

@@ -9,6 +9,7 @@ from functools import partial
 from itertools import count
 from operator import attrgetter
 from pathlib import Path
+from random import Random
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -22,7 +23,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap
+from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
@@ -33,6 +34,7 @@ from tests.support.tables import table
 
 T0 = 1_700_000_000 * S
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+CARRYING = {"topic": "/bumper", "condition_type": "equals", "value": True}
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +91,81 @@ def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
             assert said[room]["seconds"] == pytest.approx(seconds, abs=len(own) + 1)
         metres = sum(driven[each]["metres"] for each in named[:-1])
         assert driven["all"]["metres"] == pytest.approx(metres, abs=0.05)
+
+
+@settings(max_examples=examples(8))
+@given(seed=st.integers(0, 10_000), stored=st.booleans(), room=st.sampled_from([*ROOMS]))
+def test_metres_and_visits_while_a_topic_meets_a_condition_are_those_of_that_time(
+    seed: int, stored: bool, room: str
+) -> None:
+    world, chance = draw(seed, 150), Random(seed)
+    carries = [state for _ in range(15) for state in [chance.random() < 0.5] * 10]
+    # Each half of a second is in the room that the robot is in at the whole second beside it.
+    halves = [
+        (world.room(nth + late) == room, abs(world.x[nth + 1] - world.x[nth]) / 2)
+        for nth in range(149)
+        if carries[nth]
+        for late in (0, 1)
+    ]
+    own = world.runs_in(room)
+    counted = [run for run in own if any(carries[max(run.first - 1, 0) : run.last + 1])]
+    entries = sum(run.first > 0 and carries[run.first - 1] for run in own)
+    with TemporaryDirectory() as name:
+        bags = Path(name)
+        write(world, bags)
+        write_splits(bags / "flags", [boolean((BEGIN + n) * S, carries[n]) for n in range(150)], 20)
+        memory = asked_of(bags, stored=stored)
+        span = {"start": BEGIN, "end": BEGIN + 149, "while": CARRYING}
+        driven = asked(memory, "trajectory_summary", **span)
+        assert driven["distance_m"] == pytest.approx(sum(m for _, m in halves), abs=0.3)
+        assert driven["duration_s"] == pytest.approx(len(halves) / 2, abs=0.01)
+        assert driven.keys().isdisjoint({"where", "visits", "unknown_s", "error"})
+        inside = asked(memory, "trajectory_summary", **span, where=room)
+        metres = sum(m for is_inside, m in halves if is_inside)
+        seconds = sum(is_inside for is_inside, _ in halves) / 2
+        assert inside["distance_m"] == pytest.approx(metres, abs=0.3)
+        assert inside["duration_s"] == pytest.approx(seconds, abs=0.3)
+        assert inside["visits"] == len(counted)
+        for where, wanted in (({}, driven), ({"where": room}, inside)):
+            by_hour = table(asked(memory, "trajectory_summary", **span, **where, by="hour"))
+            assert by_hour["all"]["metres"] == pytest.approx(wanted["distance_m"], abs=0.01)
+        by_place = table(asked(memory, "trajectory_summary", **span, by="place"))
+        assert by_place[room]["metres"] == pytest.approx(metres, abs=0.3)
+        assert by_place["all"]["metres"] == pytest.approx(driven["distance_m"], abs=0.01)
+        visited = asked(memory, "visits", **span, where=room, limit=100)
+        assert [row["arrived"] - BEGIN for row in reversed(visited["visits"])] == [
+            run.first for run in counted
+        ]
+        assert (visited["entries"], "there_now" in visited) == (entries, False)
+        assert visited["minutes"] == pytest.approx(seconds / 60, abs=0.02)
+        of_each = {row["place"]: row for row in asked(memory, "visits", **span)["places"]}
+        assert of_each[room]["minutes"] == visited["minutes"]
+        for by in ("hour", "place"):
+            rows = table(asked(memory, "visits", **span, where=room, by=by))
+            assert rows["all"]["entries"] == entries
+            assert rows["all"]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("trajectory_summary", {}), ("visits", {"x": 0, "y": 0})]
+)
+def test_a_while_of_a_topic_that_fell_silent_says_for_how_long_it_is_not_known(
+    tmp_path: Path, name: str, given: dict[str, Any]
+) -> None:
+    poses = [odom(T0 + nth * S, nth / 10, 0.0) for nth in range(101)]
+    flags = [boolean(T0 + nth * S, True) for nth in range(41)]
+    memory = remembered(tmp_path, sorted([*poses, *flags], key=attrgetter("log_time")))
+    span = {"start": T0 // S, "end": T0 // S + 100}
+    for by in ({}, {"by": "hour"}):
+        found = asked(memory, name, **given, **span, **by, **{"while": CARRYING})
+        unknown_s = table(found)["all"]["unknown_s"] if by else found["unknown_s"]
+        assert unknown_s == pytest.approx(60, abs=0.1)
+        unmet = {"topic": "/bumper", "condition_type": "above", "value": 3}
+        refused = asked(memory, name, **given, **span, **by, **{"while": unmet})
+        assert refused["error"] == "invalid_arguments"
+        absent = {**CARRYING, "topic": "/absent"}
+        none = asked(memory, name, **given, **span, **by, **{"while": absent})
+        assert "error" in none
 
 
 @pytest.mark.parametrize(
