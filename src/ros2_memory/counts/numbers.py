@@ -1,4 +1,4 @@
-"""The numbers of a topic in each bin of a window: how many messages, least, greatest, mean.
+"""The numbers of a topic in each bin of a window: how many messages, first, last, least and others.
 
 Columns are read newest first. When time runs out, everything after some moment has been counted.
 A stored number may be off by the error of its column, and so may a sum of them. Which number is
@@ -102,8 +102,8 @@ class Part(NamedTuple):
     """A summary of the numbers of one field in consecutive messages of one piece.
 
     Attributes:
-        first: log time of the first message.
-        last: log time of the last message.
+        first: log time of the first message with a number.
+        last: log time of the last message with a number.
         size: how many numbers there are.
         total: their sum times `SUM_SCALE`.
         least: the least number.
@@ -219,6 +219,17 @@ class PieceNumbers:
                 least = min(least, self._exact_extreme(field, sign, extreme))
         return (least.low * sign, least.first) if candidates else None
 
+    def number_at(self, field: int, at: Ns) -> float | None:
+        """Returns the number in the message at a log time; None if it has several.
+
+        None, too, if there is no time left for a bag that has to be read for it.
+        """
+        unknown = Extreme(-math.inf, math.inf, at, at)
+        least, greatest = (
+            sign * self._exact_extreme(field, sign, unknown).low for sign in (LEAST, GREATEST)
+        )
+        return least if least == greatest else None
+
     def _add_newer_than(self, at: Ns) -> None:
         """Adds the pending tables after `at`: no table still to be scanned overlaps them.
 
@@ -247,7 +258,8 @@ class PieceNumbers:
         is_in_piece = rows.first >= since and piece == bisect_right(self._edges, rows.last)
         if is_in_piece:
             outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
-            parts = [part for part in outlines if part is not None]
+            # If some messages lack a number, the column says which have the first and the last.
+            parts = [part for part in outlines if part is not None and part.size >= len(rows)]
             if len(parts) == len(outlines):
                 yield from (((field, piece), part) for field, part in enumerate(parts))
                 return
@@ -304,13 +316,11 @@ class PieceNumbers:
         """Yields the numbers of each field in the rows from log time `since` on."""
         outlines = [self._outlined(rows, field) for field in range(len(numbers_of_fields))]
         for piece, start, stop in self._pieces(rows, since):
-            is_whole = stop - start == len(rows)
-            first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
             for field, field_numbers in enumerate(numbers_of_fields):
                 begin, end = np.searchsorted(field_numbers.rows, [start, stop]).tolist()
                 if begin < end:
                     piece_numbers = _numbers_at(field_numbers, np.arange(begin, end))
-                    part = _part_of(rows, piece_numbers, first, last, outlines[field])
+                    part = _part_of(rows, piece_numbers, outlines[field])
                     yield (field, piece), part
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[_PieceRows]:
@@ -445,13 +455,12 @@ def _column_extreme(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extre
     return Extreme(low, high, *rows.times[field_numbers.rows[first_and_last]].tolist())
 
 
-def _part_of(
-    rows: Rows, field_numbers: FieldNumbers, first: Ns, last: Ns, outline: Part | None
-) -> Part:
-    """Returns the summary of numbers in messages from `first` to `last` (inclusive).
+def _part_of(rows: Rows, field_numbers: FieldNumbers, outline: Part | None) -> Part:
+    """Returns the summary of some numbers of a table.
 
     `outline` summarises the whole table. Its extremes are exact, so they are used if they lie here.
     """
+    first, last = rows.times[field_numbers.rows[[0, -1]]].tolist()
     least, greatest = (_column_extreme(rows, field_numbers, sign) for sign in (LEAST, GREATEST))
     if outline is not None:
         if first <= outline.least.first <= outline.least.last <= last:
@@ -497,7 +506,13 @@ def _exact_least(rows: Rows, field_numbers: FieldNumbers, sign: int) -> Extreme:
 
 
 class _FieldCell(NamedTuple):
-    """The numbers of a field in a bin, in the columns of a reply; `..._at` are log times."""
+    """The numbers of a field in a bin, in the columns of a reply; `..._at` are log times.
+
+    `first` and `last` are None where the first or the last message has several numbers.
+    """
+
+    first: float | None
+    last: float | None
 
     min: float
     min_at: Ns
@@ -617,8 +632,19 @@ def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _FieldC
     # A sum of rounded numbers may put the mean beside the exact extremes.
     mean = min(max(mean, least_number), greatest_number)
     largest = max(abs(least_number), abs(greatest_number))
-    low, high, middle = (
-        rounded_beside(number, largest) for number in (least_number, greatest_number, mean)
+    first = collected.number_at(field, min(part.first for part in parts))
+    last = collected.number_at(field, max(part.last for part in parts))
+
+    def shown(number: float) -> float:
+        # Plus 0 makes -0.0 positive, which replies show as 0.
+        return rounded_beside(number, largest) + 0
+
+    return _FieldCell(
+        None if first is None else shown(first),
+        None if last is None else shown(last),
+        shown(least_number),
+        least_at,
+        shown(greatest_number),
+        greatest_at,
+        shown(mean),
     )
-    # Plus 0 makes -0.0 positive, which replies show as 0.
-    return _FieldCell(low + 0, least_at, high + 0, greatest_at, middle + 0.0)

@@ -16,7 +16,17 @@ from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.results import Bins
-from tests.support.bags import Msg, battery, header, make, odom, text, write_mcap, write_splits
+from tests.support.bags import (
+    Msg,
+    battery,
+    header,
+    make,
+    octets,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.tables import table
@@ -236,6 +246,28 @@ def test_tiny_numbers_keep_their_digits_and_noise_beside_others_does_not(tmp_pat
     assert row["value.mean"] == pytest.approx(1.1667e-5)
     write_numbers(tmp_path, ("Float64", 2.5), ("Float64", 1e-17))
     assert asked(memory, "get_topic_in_range", **given)["extremes"]["value"]["min"] == 0.0
+
+
+@in_zone("UTC")
+@each_way
+def test_what_was_used_in_an_hour_is_its_first_number_less_its_last(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """Messages without a number are none of them; a list has neither."""
+    levels = [0.9 - n / 1000 if n % 60 else math.nan for n in range(180)]
+    messages = [battery(BEGIN + n * 60 * S, level) for n, level in enumerate(levels)]
+    write(tmp_path, [*messages, octets(BEGIN + 10_790 * S, [1, 2, 3])])
+    memory = memory_of(tmp_path, recalls=recalls)
+    span = {"start": BEGIN // S, "end": BEGIN // S + 3 * HOUR, "by": "hour"}
+    given = {"topic": "/battery_state", "fields": ["percentage"], **span}
+    hours = table(asked(memory, "get_topic_in_range", **given))
+    firsts = [*levels[1::60], levels[1]]
+    assert [row["percentage.first"] for row in hours.values()] == pytest.approx(firsts, abs=1e-6)
+    lasts = [*levels[59::60], levels[-1]]
+    assert [row["percentage.last"] for row in hours.values()] == pytest.approx(lasts, abs=1e-6)
+    given = {"topic": "/octets", "fields": ["data"], **span}
+    row = table(asked(memory, "get_topic_in_range", **given))["all"]
+    assert (row["data.first"], row["data.last"], row["data.min"]) == (None, None, 1)
 
 
 @each_way

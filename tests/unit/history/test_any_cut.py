@@ -246,6 +246,9 @@ def check_numbers(ask: Ask, dated: Mapping[str, list[Plain]]) -> None:
                     at = next((near(at) for each, at in known if each == value), None)
                     assert shown[f"{field}.{key}"] == pytest.approx(value, abs=2e-6)
                     assert shown[f"{field}.{key}_at_unix"] == at
+                for key, end in (("first", 0), ("last", -1)):
+                    value = known[end][0] if known else None
+                    assert shown[f"{field}.{key}"] == pytest.approx(value, abs=2e-6)
                 mean = math.fsum(each for each, _ in known) / len(known) if known else None
                 assert shown[f"{field}.mean"] == pytest.approx(mean, abs=0.02)
 
