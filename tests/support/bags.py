@@ -492,7 +492,7 @@ def goals(ns: int, statuses: Mapping[int, int]) -> Msg:
     return Msg("/drive/_action/status", "action_msgs/msg/GoalStatusArray", ns, body)
 
 
-def battery(ns: int, percentage: float, log_time: int | None = None) -> Msg:
+def battery(ns: int, percentage: float, log_time: int | None = None, *, location: str = "") -> Msg:
     """A BatteryState that discharges; `percentage` is a fraction, as the message has it."""
     body = make(
         "sensor_msgs/msg/BatteryState",
@@ -510,7 +510,7 @@ def battery(ns: int, percentage: float, log_time: int | None = None) -> Msg:
         present=True,
         cell_voltage=np.array([], dtype=np.float32),
         cell_temperature=np.array([], dtype=np.float32),
-        location="",
+        location=location,
         serial_number="",
     )
     logged = ns if log_time is None else log_time

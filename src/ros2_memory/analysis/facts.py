@@ -128,10 +128,22 @@ def state_of(value: JsonValue, type_name: str) -> State:
     return State(tuple(tracked), counts.total() - len(tracked))
 
 
-def node_of(value: JsonValue) -> str:
-    """Returns the node that publishes diagnostics, by the first status of an extracted message."""
-    names = (status.get("name") for status in _entries(value, "status"))
+def source_of(value: JsonValue, type_name: str) -> str:
+    """Returns whose an extracted message is, of several that share a topic; empty for others.
+
+    Of diagnostics it is the node, by the first status, of a battery its location.
+    """
+    names: list[JsonValue] = []
+    if type_name == DIAGNOSTICS:
+        names = [status.get("name") for status in _entries(value, "status")]
+    elif type_name == BATTERY and isinstance(value, dict):
+        names = [value.get("location")]
     return shortened(next((name for name in names if isinstance(name, str)), ""), _MAX_CHARS)
+
+
+def battery_of(topic: str, location: str) -> str:
+    """Returns the name of a battery, by its `source_of`."""
+    return f"{topic} ({location})" if location else topic
 
 
 def charge_of(value: JsonValue) -> float | None:
@@ -241,7 +253,7 @@ def _charge(value: JsonValue) -> Iterator[Fact]:
     charge = charge_of(value)
     level = -1 if charge is None else int(charge_levels(np.array([charge]))[0])
     if level >= 0:
-        yield Word(CHARGE), level
+        yield Word(CHARGE, source_of(value, BATTERY)), level
 
 
 def _command(value: JsonValue) -> Iterator[Fact]:

@@ -33,6 +33,7 @@ from ros2_memory.analysis.facts import (
     has_events,
     is_still,
     joined_facts,
+    source_of,
     state_of,
 )
 from ros2_memory.columns.detections import Source, detections_in, sources_in
@@ -97,26 +98,29 @@ class StatedColumns:
 
 
 class Nodes:
-    """Numbers the nodes that publish diagnostics, by the first status that a message has.
+    """Numbers the sources that share a topic, as `facts.source_of` names them.
 
     Args:
         extractor: has the schema map.
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._leaves = ByType(extractor, lambda shape: _entry_leaves(shape.value, shape.type).name)
+        self._leaves = ByType(extractor, _source_leaves)
         self._numbers = {"": 0}
 
     def of(self, table: Table) -> IntArray | None:
-        """Returns the number of each row's node, 0 without a status; None if no column has it."""
+        """Returns the number of each row's source, 0 without one; None if no column has it."""
         nodes = np.zeros(len(table), np.int64)
-        if table.channel.type != DIAGNOSTICS:
+        if table.channel.type not in {DIAGNOSTICS, BATTERY}:
             return nodes
-        leaf = self._leaves.of(table)
-        if leaf is None or leaf.level.parent is not ROWS:
-            return None
+        leaves, values = self._leaves.of(table), Values(table)
+        if not leaves:
+            return None if leaves is None else nodes
+        [leaf] = leaves
         try:
-            names, owners = Values(table).texts(leaf), Values(table).elements(leaf.level).owners
+            names, owners = values.texts(leaf), np.arange(len(table))
+            if leaf.level != ROWS:
+                owners = values.elements(leaf.level).owners
         except UnknownShapeError:
             return None
         numbers = [self._numbers.setdefault(name, len(self._numbers)) for name in names.words]
@@ -155,7 +159,7 @@ def _reader_of(shape: Shape) -> Reader:
     if commands:
         numbers = partial(_command_facts, commands)
     elif [charge.kind for charge in charges] == [Kind.REAL]:
-        numbers = partial(_charge_facts, charges[0])
+        numbers = partial(_charge_facts, charges[0], _source_leaves(shape))
     flags = [*_flag_leaves(value, "")] if has_events(type_name) else []
     if len(flags) > MOST[FLAG]:
         raise UnknownShapeError("more booleans than are tracked")
@@ -164,6 +168,17 @@ def _reader_of(shape: Shape) -> Reader:
 
 
 # Where a type has what it states
+
+
+def _source_leaves(shape: Shape) -> list[Leaf]:
+    """Returns where messages of diagnostics, or of a battery, name their source, if anywhere."""
+    if shape.type == BATTERY:
+        locations = _leaves_at(shape.value, "location")
+        return [leaf for leaf in locations if leaf.kind is Kind.TEXT and leaf.level == ROWS]
+    name = _entry_leaves(shape.value, shape.type).name
+    if name.level.parent is not ROWS:
+        raise UnknownShapeError("the definition is not the standard one")
+    return [name]
 
 
 def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
@@ -262,13 +277,17 @@ def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") 
     return state_of(value, type_name).facts
 
 
-def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, IntArray]:
-    """Returns how low a battery is, and the rows in which rounding may have changed that."""
+def _charge_facts(leaf: Leaf, locations: Sequence[Leaf], values: Values) -> tuple[Facts, IntArray]:
+    """Returns how low batteries are, and the rows in which rounding may have changed that."""
     charges, error = values.floats(leaf)
     levels = charge_levels(charges)
     low, high = charge_levels(charges - error), charge_levels(charges + error)
     settled = np.flatnonzero((levels >= 0) & (low == high))
     charge = _facts_of(CHARGE, settled, levels[settled])
+    for location in locations:
+        texts = values.texts(location)
+        words = [Word(CHARGE, source_of({"location": word}, BATTERY)) for word in texts.words]
+        charge = charge._replace(codes=texts.codes[settled].astype(np.int64), words=words)
     return charge, np.flatnonzero(low != high)
 
 

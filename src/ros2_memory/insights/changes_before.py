@@ -26,6 +26,7 @@ from ros2_memory.analysis.facts import (
     LOW_CHARGES,
     STATUS,
     VELOCITIES,
+    battery_of,
     charge_of,
     has_changes,
     has_events,
@@ -34,7 +35,7 @@ from ros2_memory.analysis.goals import GOAL_WORDS
 from ros2_memory.analysis.topic_events import NO_EVENTS, Change, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.text import Quoted, shortened
+from ros2_memory.core.text import Quoted, repeating, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.conditions import newest_above
 from ros2_memory.history.coverage import note_edges, note_unread
@@ -306,12 +307,13 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
     for together in toggled_together(change for change in events.changes if change.kind == FLAG):
         at = together[0].time
         yield _DatedChange(at, at, toggle_sentence(topic, *together), topic)
-    level = next((state.first for state in events.known if state.kind == CHARGE), 0)
+    levels = {state.name: state.first for state in events.known if state.kind == CHARGE}
     for change in events.changes:
         is_accepted_before = change.kind == GOAL and change.value not in GOAL_WORDS
+        level = levels.get(change.name, 0)
         text = "" if is_accepted_before else _change_sentence(topic, change, level)
         if change.kind == CHARGE:
-            level = change.value
+            levels[change.name] = change.value
         if text:
             yield _DatedChange(change.time, change.time, text)
     for kind, name, at, first, _, said in events.known:
@@ -331,7 +333,8 @@ def _change_sentence(topic: str, change: Change, level_before: int) -> str:
     if change.kind == GOAL:
         return f"{action_of(topic)} goal {GOAL_WORDS.get(change.value, 'accepted')}"
     if change.kind == CHARGE and change.value > level_before:
-        return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
+        who, low = battery_of(topic, change.name), LOW_CHARGES[change.value - 1]
+        return repeating(f"{who} fell below {low:.0%}", [change.name])
     return ""
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from heapq import nsmallest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, charge_of, has_events
+from ros2_memory.analysis.facts import CHARGE, FLAG, LOW_CHARGES, battery_of, charge_of, has_events
 from ros2_memory.analysis.goals import FAILURES
 from ros2_memory.analysis.intervals import (
     SILENCE_NS,
@@ -23,7 +23,7 @@ from ros2_memory.analysis.intervals import (
 )
 from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.silences import length_in
-from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import overlaps_any
@@ -649,25 +649,33 @@ def _flip_events(
 
 
 def _low_charge_events(view: View, topic: str, events: TopicEvents) -> Iterator[Event]:
-    """Yields each time in which a battery was below `_LOW_CHARGE`, with how low it became.
+    """Yields each time in which a battery was below `_LOW_CHARGE`, with how low it became."""
+    charges, changes = events.of_kind(CHARGE)
+    for charge in charges:
+        own = [change for change in changes if change.name == charge.name]
+        yield from _low_times(view, topic, charge, own, events.last)
+
+
+def _low_times(
+    view: View, topic: str, charge: KnownState, changes: Sequence[Change], last: Ns
+) -> Iterator[Event]:
+    """Yields the events of one battery, whose topic has messages until `last`.
 
     A driver that does not know the charge may always say 0.
     """
-    charges, changes = events.of_kind(CHARGE)
-    levels = [(state.at, state.first) for state in charges]
-    levels += [(change.time, change.value) for change in changes]
-    begins = {state.at for state in charges}
+    levels = [(charge.at, charge.first), *((change.time, change.value) for change in changes)]
     since, lowest = None, 0
     for time, level in [*levels, (MAX_NS, 0)]:
         if level > LOW_CHARGES.index(_LOW_CHARGE):
             since, lowest = time if since is None else since, max(level, lowest)
         elif since is not None:
-            goes_on, is_begun = time == MAX_NS, since not in begins
+            goes_on, is_begun = time == MAX_NS, since != charge.at
             if goes_on and not is_begun and _says_zero(view, topic, since):
                 return
             verb = "fell" if is_begun else "was"
-            text = f"{topic} {verb} below {LOW_CHARGES[lowest - 1]:.0%}"
-            yield Event("low battery", since, min(time, events.last), text, goes_on=goes_on)
+            who, low = battery_of(topic, charge.name), LOW_CHARGES[lowest - 1]
+            text = repeating(f"{who} {verb} below {low:.0%}", [charge.name])
+            yield Event("low battery", since, min(time, last), text, goes_on=goes_on)
             since, lowest = None, 0
 
 

@@ -27,7 +27,7 @@ from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-from ros2_memory.analysis.facts import DIAGNOSTICS, node_of
+from ros2_memory.analysis.facts import source_of
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start, split_number
@@ -161,16 +161,16 @@ class Rule:
         if run is None or run.fired or time - run.first < self.hold:
             return None
         run.fired = True
-        # Without the node: names of topics have no spaces.
+        # Without the source: names of topics have no spaces.
         return Firing(self.name, topic.partition(" ")[0], run.first, run.first + self.hold)
 
 
 def _source_of(event: _Event, value: JsonValue | UndecodableError) -> str:
-    """Returns whose match a message goes on or ends: its topic's, and of diagnostics its node's."""
+    """Returns whose match a message goes on or ends: its topic's, or its `source_of`."""
     if event.record is None or isinstance(value, UndecodableError):
         return event.topic
-    is_of_node = event.record.channel.type == DIAGNOSTICS
-    return f"{event.topic} {node_of(value)}" if is_of_node else event.topic
+    source = source_of(value, event.record.channel.type)
+    return f"{event.topic} {source}" if source else event.topic
 
 
 def _drop_ended(runs: MutableMapping[str, RunRecord], begin: str, time: Ns) -> None:

@@ -85,6 +85,28 @@ def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recall
 
 
 @each_way
+def test_two_batteries_on_one_topic_run_low_one_by_one(tmp_path: Path, recalls: bool) -> None:
+    told = []
+    for second in range(100):
+        at, charge = BEGIN + second * S, 0.1605 - second / 1000
+        told += [
+            battery(at, charge, location="left"),
+            battery(at + 1000, 0.8),
+            battery(at + 2000, 0.7, location="in the trailer"),
+        ]
+    memory = remembered(tmp_path, told, recalls=recalls)
+    low = [(event.text, since(event.start)) for event in over(memory, 0, 100).events]
+    assert low == [("/battery_state (left) fell below 10%", 61)]
+    span = {"start": BEGIN // S, "end": BEGIN // S + 100}
+    below = {"topic": "/battery_state", "condition_type": "below", "value": 0.1, **span}
+    found = asked(memory, "find_matches", **below, field="percentage")
+    assert [row["count"] for row in found["sightings"]] == [39]
+    assert asked(memory, "find_matches", **below, field="percentage", by="day")["all"][2] == 1
+    changes = asked(memory, "recap", around=BEGIN // S + 65)["before"]
+    assert [each["text"] for each in changes] == ["/battery_state (left) fell below 10%"]
+
+
+@each_way
 def test_a_boolean_that_is_true_in_its_first_message_says_how_long_it_was(
     tmp_path: Path, recalls: bool
 ) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import RunRecord
-from tests.support.bags import Msg, boolean, diagnostics
+from tests.support.bags import Msg, battery, boolean, diagnostics
 from tests.support.examples import examples
 from tests.support.watched_bags import SILENT, T0, S, WatchedBags, flag, rule
 
@@ -194,6 +194,24 @@ def test_the_field_of_a_rule_may_be_a_full_path(tmp_path: Path) -> None:
     robot.split([flag(0, False), flag(1, True)])
     robot.close_all()
     assert robot.fired_at() == [1]
+
+
+def test_a_full_battery_does_not_end_the_low_charge_of_another_on_its_topic(
+    tmp_path: Path,
+) -> None:
+    low = parse_condition("below", 0.2, 0.5, "percentage")
+    robot = WatchedBags(
+        tmp_path / "bags", [rule(topic="/battery_state", condition=low, hold=3 * S)]
+    )
+    robot.begin(T0)
+    messages = []
+    for second in range(20):
+        charge = 0.1 if second >= 5 else 0.3
+        messages.append(battery(T0 + second * S, charge, location="left"))
+        messages.append(battery(T0 + second * S + 1000, 0.9, location="right"))
+    robot.split(messages)
+    robot.close_all()
+    assert robot.fired_at() == [8]
 
 
 @pytest.mark.parametrize(("hold_s", "fires_at"), [(0, [5]), (3, [8]), (30, [])])
