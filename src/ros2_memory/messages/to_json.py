@@ -47,6 +47,7 @@ MAX_EXACT_NUMBERS: Final = 1_000_000
 MAX_TEXT: Final = 2000
 """Characters of one string in a reply."""
 
+_COVARIANCE: Final = "covariance"
 _METRIC_DECIMALS: Final = 4
 """Of metres, m/s and rad/s."""
 _DEGREE_DECIMALS: Final = 2
@@ -206,7 +207,7 @@ class ExactJson:
         is_plain = isinstance(plain, bool | int | bytes)
         return self.value(plain if is_plain else str(plain), path, MAX_DEPTH - 1)
 
-    # What a reply rounds or shortens, and notes.
+    # What a reply rounds, shortens or leaves out, and notes.
 
     def _number(self, number: float | np.float32, /) -> JsonValue:
         return int(number) if isinstance(number, int) else float(number)
@@ -256,6 +257,16 @@ class ReplyJson(ExactJson):
         if more > 0:
             notes[MAX_NOTES:] = [f"and {more} more notes of this kind"]
         return tuple(notes)
+
+    def _message(self, node: object, layout: Layout, path: str, depth: int) -> JsonValue:
+        shown = super()._message(node, layout, path, depth)
+        if isinstance(shown, dict):
+            for name in [name for name in shown if name.endswith(_COVARIANCE)]:
+                numbers = shown[name]
+                # All zeros, or NaN, say that it is not known.
+                if isinstance(numbers, list) and not any(numbers):
+                    del shown[name]
+        return shown
 
     def _number(self, number: float | np.float32, /) -> JsonValue:
         if isinstance(number, int):

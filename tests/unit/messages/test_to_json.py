@@ -2,7 +2,9 @@
 
 import json
 import math
+from functools import partial
 from itertools import count
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,6 +23,10 @@ from ros2_memory.messages.to_json import (
     round_single,
 )
 from tests.support import bags
+from tests.support.memories import asked, remembered
+
+S = 10**9
+T0 = 1_784_000_000 * S
 
 
 def shown(node: object, limit: int = 50, path: str = "") -> tuple[JsonValue, tuple[str, ...]]:
@@ -30,6 +36,18 @@ def shown(node: object, limit: int = 50, path: str = "") -> tuple[JsonValue, tup
 
 def exact(node: object, limit: int = 50) -> JsonValue:
     return ExactJson(limit).value(node, "")
+
+
+def test_a_covariance_of_zeros_is_left_out_unless_it_is_asked_for(tmp_path: Path) -> None:
+    """Zeros say that it is not known."""
+    unknown, known = bags.odom(T0, 1.0), bags.odom(T0 + S, 1.0)
+    known.body.pose.covariance[:] = np.arange(36.0)  # type: ignore[attr-defined]
+    memory = remembered(tmp_path, [unknown, known])
+    ask = partial(asked, memory, "get_topic_at_time", topic="/odom", tolerance_s=0)
+    fields = {"fields": ["pose", "pose.covariance[1]"]}
+    zeros, numbers = (ask(timestamp=(T0 + n * S) / S, **fields)["value"] for n in (0, 1))
+    assert (zeros["pose"].keys(), zeros["pose.covariance.1"]) == ({"pose"}, 0)
+    assert (numbers["pose"]["covariance"], numbers["pose.covariance.1"]) == ([*range(36)], 1)
 
 
 WIDTHS = (np.float16(0.5), np.longdouble(0.5), np.float64(0.5))
