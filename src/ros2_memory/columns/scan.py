@@ -32,7 +32,7 @@ from ros2_memory.columns.units import (
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
 from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
+from ros2_memory.core.spans import COPY_HORIZON_NS, COPY_JITTER_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import REPEATED_NS, IntArray, Mask
@@ -436,12 +436,13 @@ class Scan:
     # Copies
 
     def _may_have_copies(self, span: Span) -> bool:
-        """Returns whether two sources in a span may have messages of one publish time."""
+        """Returns whether two sources in a span may have one message, by their publish times."""
         published = sorted(
             self._published.get(source.number, (-math.inf, math.inf))
             for source in self._sources_in(TimeWindow(*span))
         )
-        return any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published))
+        pairs = pairwise(published)
+        return any(latest + COPY_JITTER_NS >= earliest for (_, latest), (earliest, _) in pairs)
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""

@@ -2,8 +2,10 @@
 
 Recordings overlap for some seconds while one takes over from the other. A message that is in both
 has the same publish time and payload in each, and log times that differ by at most
-`COPY_HORIZON_NS`. It counts once, at its earliest log time; if one recording has it n times and
-another m times, it counts max(n, m) times. Equal messages of one recording are no copies.
+`COPY_HORIZON_NS`. Some recorders, as those of Humble, write the log time as publish time: then it
+has the same payload, and log times that differ by at most `COPY_JITTER_NS`. It counts once, at its
+earliest log time; if one recording has it n times and another m times, it counts max(n, m) times.
+Equal messages of one recording are no copies.
 
 A latched message is received again by each new recording. It counts at its earliest log time,
 however long ago that is.
@@ -21,7 +23,7 @@ import numpy as np
 from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.arrays import Flags, Groups, distinct_rows, places_within, run_starts
 from ros2_memory.core.errors import BusyError
-from ros2_memory.core.spans import COPY_HORIZON_NS
+from ros2_memory.core.spans import COPY_HORIZON_NS, COPY_JITTER_NS
 from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import REPEATED_NS, IntArray
 
@@ -271,6 +273,16 @@ def copies_among(messages: Identities) -> Flags:
 
     Of messages with one log time that of the recording with the lowest number counts.
     """
+    is_copy = _copies_within(messages, COPY_HORIZON_NS)
+    is_logged = (messages.publish_times == messages.log_times) | (messages.publish_times == 0)
+    undated = np.flatnonzero(is_logged & ~is_copy)
+    by_payload = messages.rows(undated)._replace(publish_times=np.zeros(undated.size, np.int64))
+    is_copy[undated] = _copies_within(by_payload, COPY_JITTER_NS)
+    return is_copy
+
+
+def _copies_within(messages: Identities, horizon: Ns) -> Flags:
+    """Returns which messages another recording has at most `horizon` (ns) before."""
     is_copy = np.zeros(messages.log_times.size, np.bool_)
     suspects = _shared_by_recordings(messages)
     suspected = messages.rows(suspects)
@@ -281,7 +293,7 @@ def copies_among(messages: Identities) -> Flags:
     columns = (column.tolist() for column in messages.rows(order))
     rows = zip(order.tolist(), *columns, strict=True)
     for row, time, published, payload, recording in rows:
-        while counted and counted[0][0] < time - COPY_HORIZON_NS:
+        while counted and counted[0][0] < time - horizon:
             _, message = counted.popleft()
             left = {number: count - 1 for number, count in counts.pop(message).items() if count > 1}
             if left:

@@ -6,7 +6,7 @@ from bisect import bisect_right
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 """How far apart the log times of one message in two recordings are at most."""
+COPY_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
+"""The same where recorders give a message no publish time but its log time."""
 Spans: TypeAlias = list[Span]
 """Sorted and apart, where functions return them."""
 

@@ -79,6 +79,11 @@ class StoredMessage(NamedTuple):
         """Publish time and CRC-32 of the payload: copies of a message of a topic share these."""
         return self.record.publish_time, crc32(self.record.payload)
 
+    @property
+    def is_undated(self) -> bool:
+        """Whether the recorder had no publish time: it is 0, or the log time."""
+        return self.record.publish_time in {0, self.time}
+
 
 class Reading:
     """How a part of a call read bags.

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.history.bag_access import BagAccess, StoredMessage
 
 _MessageKey: TypeAlias = tuple[str, Ns, Ns, int]
@@ -168,12 +169,11 @@ class MergedStream:
         recordings = sorted({str(extent.bag.recording) for extent in extents})
         number_of = {recording: number for number, recording in enumerate(recordings)}
         keys: list[_MessageKey] = []
-        rows: list[tuple[Ns, Ns, int, int]] = []
+        messages: list[tuple[int, StoredMessage]] = []
         for stored in self.merged(extents, [topic], around, since=part.start):
             keys.append((stored.bag.file, stored.time, *stored.identity))
-            rows.append((stored.time, *stored.identity, number_of[str(stored.recording)]))
-        columns = np.array(rows, np.int64).reshape(-1, 4).T
-        return Counter(compress(keys, copies_among(Identities(*columns))))
+            messages.append((number_of[str(stored.recording)], stored))
+        return Counter(compress(keys, copies_in(messages)))
 
     def find_first_copy(self, stored: StoredMessage) -> None:
         """Reads bags that may have a message earlier, for the notes on what is damaged there."""
@@ -246,6 +246,16 @@ class MergedStream:
         for _, _, stored in heapq.merge(*(received(sign * rank, bag) for rank, bag in in_order)):
             if stored is not None:
                 yield stored
+
+
+def copies_in(messages: Iterable[tuple[int, StoredMessage]]) -> Flags:
+    """Returns which messages of a topic are copies, by `copies_among`.
+
+    Args:
+        messages: each with the number of its recording.
+    """
+    rows = [(stored.time, *stored.identity, number) for number, stored in messages]
+    return copies_among(Identities(*np.array(rows, np.int64).reshape(-1, 4).T))
 
 
 def _part_with_messages(extent: TopicExtent, window: TimeWindow) -> TimeWindow:

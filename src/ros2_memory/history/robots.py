@@ -23,6 +23,7 @@ from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.merged_stream import copies_in
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import loose_bags_beside_others, recordings_of
@@ -502,6 +503,11 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
             _lacks_most(view, topic, here, there, both)
             for here, there in ((first, other), (other, first))
         )
+        if not differ and topic != view.pose_topic:
+            # By its payload alone a boolean may be any robot's: poses show whose it is.
+            tried = next(view.stream.merged(first, [topic], both), None)
+            by_payload = tried is not None and tried.is_undated
+            differ = by_payload and _differ(view, view.pose_topic, pair, both)
     if reading.is_final:
         if len(remembered) >= MOST_REMEMBERED:
             remembered.clear()
@@ -526,9 +532,8 @@ def _lacks_most(
             continue
         tried += 1
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
-        copies = view.stream.merged(other, [topic], near)
-        if stored.identity not in (copy.identity for copy in copies):
-            lacking += 1
+        others = ((1, message) for message in view.stream.merged(other, [topic], near))
+        lacking += not copies_in(chain([(0, stored)], others)).any()
         if 2 * lacking > _TRIED:
             return True  # the rest of the sample cannot change that
     return 2 * lacking > tried

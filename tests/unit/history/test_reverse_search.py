@@ -476,7 +476,7 @@ def test_of_recordings_that_overlap_each_message_is_tested_once(tmp_path: Path) 
     """A message that cannot be decoded leaves both without columns: all messages are read."""
     for nth, name in enumerate(("one", "two")):
         said = [text(T0 + n * NS_PER_S // 10 + nth, f"{n} of {name}") for n in range(300)]
-        said[7] = replace(said[7], body=b"\x00")
+        said[7] = replace(said[7], body=bytes([nth]))
         write_mcap(tmp_path / name / f"{name}_0.mcap", said)
     memory, matches = memory_of(tmp_path), ReverseSearch.matches
     never = {"topic": "/chatter", "condition_type": "contains", "value": "nobody"}

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 from unittest.mock import Mock
 
@@ -331,6 +332,56 @@ def test_what_two_recorders_of_one_robot_lost_at_other_moments_makes_no_second_r
     ranged = asked(memory, "get_topic_in_range", topic="/odom", **window)
     assert (ranged["total"], ranged.get("notes")) == (50, None)
     assert warned(memory) == []
+
+
+def figures(memory: Memory) -> list[float]:
+    """How many messages each topic has, metres, seconds at a place, and how often a flag was on."""
+    totals = [
+        asked(memory, "get_topic_in_range", topic=topic, **WINDOW)["total"]
+        for topic in ("/odom", "/bumper", "/chatter", "/tf_static")
+    ]
+    met = {"topic": "/bumper", "condition_type": "equals", "value": True, "field": "data"}
+    (visit,) = asked(memory, "visits", x=8, y=0, radius_m=3, **WINDOW)["visits"]
+    return [
+        *totals,
+        asked(memory, "trajectory_summary", **WINDOW)["distance_m"],
+        visit["duration_s"],
+        asked(memory, "find_matches", **met, **WINDOW)["total"],
+    ]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_recorders_whose_publish_times_are_their_log_times_make_no_second_robot(
+    tmp_path: Path, seed: int
+) -> None:
+    """As Humble writes; the second began later, lacks a topic and lost some messages."""
+    draw = Random(seed)
+    poses = along_x(T0, 40, mps=0.5, hz=10)
+    flags = [boolean(T0 + n * S // 10, n // 77 % 2 == 1) for n in range(400)]
+    said = [text(T0 + n * S, "at the door") for n in (3, 9, 10, 31)]
+
+    def received(messages: list[Msg], lost: float) -> list[Msg]:
+        jittered = (
+            replace(message, log_time=at, publish_time=at)
+            for message in messages
+            if draw.random() >= lost
+            for at in [message.log_time + draw.randrange(100_000, 8_000_000)]
+        )
+        return in_order(jittered)
+
+    record(tmp_path, "a", received([*poses, *flags, *said, mounted("base_link")], 0.0))
+    expected = figures(memory_of(tmp_path))
+    record(tmp_path, "b", received([mounted("base_link"), *poses[100:], *flags[50:]], 0.02))
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        assert warned(memory) == []
+        assert figures(memory) == pytest.approx(expected, rel=1e-3)
+
+
+def test_what_two_robots_say_alike_at_other_moments_counts_for_each(tmp_path: Path) -> None:
+    record(tmp_path, "a", [*drive(0.0), text(T0 + 20 * S, "done"), text(T0 + 40 * S, "done")])
+    record(tmp_path, "b", [*drive(9.0), text(T0 + 20 * S + S // 2, "done")])
+    ranged = asked(memory_of(tmp_path), "get_topic_in_range", topic="/chatter", **WINDOW)
+    assert ranged["total"] == 3
 
 
 def test_two_robots_are_found_behind_however_many_handovers(
