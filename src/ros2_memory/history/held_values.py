@@ -602,10 +602,14 @@ def frequent_times(view: View, topic: str) -> Spans:
     """
     known = view.timeline.memo.of(_FREQUENT, dict)
     if topic not in known:
+        # A wrong clock spreads a recording over years: it counts if its session has no other.
+        misdated = {fault.bag.recording for fault in view.snapshot.dating.faults}
+        recordings = view.timeline.paces(topic).items()
         paces: dict[Session, Pace] = {}
-        for recording, pace in view.timeline.paces(topic).items():
+        for recording, pace in sorted(recordings, key=lambda item: item[0] in misdated):
             session = view.sessions.session_of(recording)
-            paces[session] = paces.get(session, pace) | pace
+            if session not in paces or recording not in misdated:
+                paces[session] = paces.get(session, pace) | pace
         known[topic] = united(
             (pace.topic.first, pace.end + 1) for pace in paces.values() if not pace.is_rare
         )

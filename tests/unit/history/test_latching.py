@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Latching, Memory, QuerySettings
@@ -54,6 +55,27 @@ def at(memory: Memory, topic: str, when: int) -> Any:
     """The reply to a question for a moment."""
     asks = {"topic": topic, "timestamp": when / S}
     return asked(memory, "get_topic_at_time", **asks)
+
+
+def test_a_boot_with_a_wrong_clock_makes_no_topic_of_its_session_rare(tmp_path: Path) -> None:
+    """A recorder that boots in 1970 has a topic of ten messages a second once a month or so."""
+
+    def ticks(begin: int, many: int) -> list[Msg]:
+        return [boolean(begin + n * S // 10, n < many - 1) for n in range(many)]
+
+    again = ticks(T0 + 300 * S, 100)
+    write_mcap(tmp_path / "r0" / "r0_0.mcap", [*ticks(100 * S, 100), *ticks(T0, 500)])
+    write_mcap(tmp_path / "r1" / "r1_0.mcap", [*ticks(T0 + 60 * S, 500), *again])
+    cut = T0 + 58 * S
+    end, begin = (Overlap(cut - S, cut + S, (f"{name}_0.mcap",)) for name in ("r0", "r1"))
+    joined = Handover(next="r1", counts_until=cut, end=end, compared=True)
+    write_handover(tmp_path / "r0", joined)
+    joined = Handover(previous="r0", counts_from=cut, begin=begin, compared=True)
+    write_handover(tmp_path / "r1", joined)
+    window = {"start": T0 / S + 60, "end": T0 / S + 400}
+    asks = {"topic": "/bumper", "by": "value", **window}
+    reply = asked(memory_of(tmp_path), "get_topic_in_range", **asks)
+    assert [row[:3] for row in reply["rows"]] == [["true", 2, 59.8], ["false", 2, 0.0]]
 
 
 @each_way
