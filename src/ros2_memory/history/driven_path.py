@@ -57,7 +57,7 @@ from ros2_memory.history.no_data import (
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows
-from ros2_memory.history.robots import parallel_or_twice
+from ros2_memory.history.robots import ParallelRecordings, parallel_or_twice
 from ros2_memory.history.scan import (
     blocks,
     joined_back,
@@ -209,17 +209,20 @@ def slices_by_poses(
                 yield pose_slice.start, made
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
-        around = stretch.window.widened(beside)
-        # The span is cut: it grows with each bag, and poses outside change nothing here.
-        near = [
-            (str(pair.other), pair.span.intersect(around), sorted(pair.bags))
-            for pair in parallel
-            if around.overlaps(pair.span.start, pair.span.stop - 1)
-        ]
-        left_out = sha256(repr(near).encode()).hexdigest()
-        return stretch.key(f"{settings} {left_out}" if near else settings)
+        return stretch.key(settings + _digest(parallel, stretch.window.widened(beside)))
 
     yield from joined_back(view, opened, kind, make_slices, key_of, beside=beside)
+
+
+def _digest(parallel: Iterable[ParallelRecordings], window: TimeWindow) -> str:
+    """Returns what tells apart which poses of a window do not count; empty if all do."""
+    # The span is cut: it grows with each bag, and poses outside change nothing here.
+    near = [
+        (str(pair.other), pair.span.intersect(window), sorted(pair.bags))
+        for pair in parallel
+        if window.overlaps(pair.span.start, pair.span.stop - 1)
+    ]
+    return f" {sha256(repr(near).encode()).hexdigest()}" if near else ""
 
 
 @dataclass(frozen=True, slots=True)
