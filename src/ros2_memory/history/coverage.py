@@ -190,7 +190,7 @@ def describe_cut(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 
 
 def _count_losses(
-    losses: Iterable[Loss], kinds: Iterable[tuple[str, Collection[str]]], window: TimeWindow
+    losses: Sequence[Loss], kinds: Iterable[tuple[str, Collection[str]]], window: TimeWindow
 ) -> Iterator[str]:
     """Yields a sentence for each kind of loss in a window: how many messages of which topics.
 

@@ -175,7 +175,7 @@ class MergedStream:
             messages.append((number_of[str(stored.recording)], stored))
         return Counter(compress(keys, copies_in(messages)))
 
-    def find_first_copy(self, stored: StoredMessage) -> None:
+    def read_up_to_first_copy(self, stored: StoredMessage) -> None:
         """Reads bags that may have a message earlier, for the notes on what is damaged there."""
         topic, window = stored.topic, _since_published(stored)
         if stored.record.may_be_repeated and self.may_be_repeated([topic]):

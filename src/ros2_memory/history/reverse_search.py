@@ -338,7 +338,7 @@ class ReverseSearch:
                 if self.matches(stored):
                     read = TimeWindow(stored.time, MAX_NS)
                     self._view.notes.retract_outside(read, keep=noted_before)
-                    self._view.stream.find_first_copy(stored)
+                    self._view.stream.read_up_to_first_copy(stored)
                     self.note_untested(read.intersect(window))
                     return stored
         except QueryTimeoutError as error:
