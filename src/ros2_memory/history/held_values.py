@@ -590,14 +590,14 @@ def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
 
 
 def holds_on(view: View, topic: str, at: Ns) -> bool:
-    """Returns whether what a topic said at a log time holds through silence: see below."""
+    """Returns whether what a topic said at a log time holds through silence."""
     return not lies_inside(frequent_times(view, topic), at)
 
 
 def frequent_times(view: View, topic: str) -> Spans:
     """Returns the times in which what a topic says does not hold through silence.
 
-    That are the sessions in which it is not rare; none, if it is latched. Another session decides
+    These are the sessions in which it is not rare; none, if it is latched. Another session decides
     nothing: its driver may be another one, and it may be deleted.
     """
     known = view.timeline.memo.of(_FREQUENT, dict)
