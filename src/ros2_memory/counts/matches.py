@@ -52,6 +52,7 @@ from ros2_memory.history.held_values import (
     holds_on,
     is_latched,
     is_text,
+    silences_of,
 )
 from ros2_memory.history.no_data import matching_topics, no_value_between, require_recorded
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -398,12 +399,14 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     return spans_of(begins, heard_again)
 
 
-def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Spans:
-    """Returns the silences of a topic in some spans; none, if what it says holds through them."""
+def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Sequence[Span]:
+    """Returns the silences of a topic in some spans through which what it says does not hold."""
     long = [span for span in spans if span.stop - span.start > SILENCE_NS]
-    frequent = frequent_times(binned.view, topic)
-    if not long or not frequent:
+    if not long:
         return []
+    silences, frequent = silences_of(binned.view, topic), frequent_times(binned.view, topic)
+    if not frequent:
+        return silences
     window = TimeWindow(long[0].start, long[-1].stop + 1)
     heard = heard_times(binned.view, (topic,), window)
     between = (
@@ -413,7 +416,7 @@ def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> S
         if lies_inside(frequent, last - 1) and window.contains(last - 1)
     )
     # A thinned day has one message of a measurement a minute.
-    return without(between, binned.view.timeline.thinned_times)
+    return [*silences, *without(between, binned.view.timeline.thinned_times)]
 
 
 def _heard_parts(span: _HeldSpan, unheard: Spans) -> list[_HeldSpan]:

@@ -5,7 +5,8 @@ because the topic is silent, or because nothing was recorded for a while. A valu
 known:
 
 - where another run of the recorder begins, unless the topic is latched;
-- after its last message, if the topic is usually frequent and falls silent for `SILENCE_NS`;
+- after its last message, if the topic is usually frequent and falls silent for `SILENCE_NS`, or
+  if it is rare, has no texts and falls silent for longer than usual (`Snapshot.silences`);
 - where messages of the topic were deleted;
 - where a message cannot be decoded, which may say another one.
 """
@@ -136,8 +137,9 @@ class HeldValues:
         self._view = view
         self._topic = topic
         self._field = field
-        self._frequent = [] if is_text(view, topic) else frequent_times(view, topic)
-        self._breaks = breaks_of(view, topic)
+        holds_on_always = is_text(view, topic)
+        self._frequent = [] if holds_on_always else frequent_times(view, topic)
+        self._breaks = (breaks_of if holds_on_always else ends_of_holding)(view, topic)
         self._undecoded: dict[Ns, Note] = {}  # by log time, which is one of the breaks
         self._reading = view.call.partial_after(READING_S)
         self.complete_since: Ns = MAX_NS
@@ -555,7 +557,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = Fal
     """
     if is_latched(view, topic) or (or_rare and holds_on(view, topic, last)):
         ends = [end, view.snapshot.latest or end]
-        ends += [moment for moment in breaks_of(view, topic) if moment >= last]
+        ends += [moment for moment in ends_of_holding(view, topic) if moment >= last]
         following = view.stream.first([topic], TimeWindow(last + 1, end + 1))
         if following is not None:
             ends.append(following.time)
@@ -574,7 +576,8 @@ def held_at(view: View, topic: str, moment: Ns, *, or_rare: bool = False) -> Sto
     before = view.stream.last(topic, moment)
     if before is None or not holds_on(view, topic, before.time):
         return None
-    return None if any(before.time <= at < moment for at in breaks_of(view, topic)) else before
+    is_over = any(before.time <= at < moment for at in ends_of_holding(view, topic))
+    return None if is_over else before
 
 
 def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
@@ -619,10 +622,15 @@ def frequent_times(view: View, topic: str) -> Spans:
 def ends_of_holding(view: View, topic: str) -> list[Ns]:
     """Returns the moments after which what a rare or latched topic said is not known to hold.
 
-    These are `breaks_of`, and where a topic with a usual rate fell silent.
+    These are `breaks_of`, and where a topic that is not latched fell silent for longer than usual.
     """
-    silences = (silence for silence in view.snapshot.silences if silence.topic == topic)
-    return sorted({*breaks_of(view, topic), *(silence.start for silence in silences)})
+    return sorted({*breaks_of(view, topic), *(start for start, _ in silences_of(view, topic))})
+
+
+def silences_of(view: View, topic: str) -> Spans:
+    """Returns when a topic with a usual rate was silent; never if it is latched."""
+    silences = () if is_latched(view, topic) else view.snapshot.silences
+    return [(silence.start, silence.end) for silence in silences if silence.topic == topic]
 
 
 def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:

@@ -1,6 +1,7 @@
 """Latched is what holds until the next message, unless messages of it may have been deleted."""
 
 from collections.abc import Collection
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,27 @@ def test_a_boot_with_a_wrong_clock_makes_no_topic_of_its_session_rare(tmp_path: 
     asks = {"topic": "/bumper", "by": "value", **window}
     reply = asked(memory_of(tmp_path), "get_topic_in_range", **asks)
     assert [row[:3] for row in reply["rows"]] == [["true", 2, 59.8], ["false", 2, 0.0]]
+
+
+@each_way
+def test_a_flag_that_came_every_twenty_seconds_holds_until_it_fell_silent(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It was true for hours in which data_time_range has its silence, and while knew nothing."""
+    ticks = [boolean(T0 + at * S, True) for at in range(0, 600, 20)]
+    write_splits(tmp_path, [*ticks, *drive(T0, T0 + 5400 * S)[::10]], 1800)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"start": T0 / S, "end": T0 / S + 5390}
+    true = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    ask = partial(asked, memory, "find_matches", **window)
+    held = asked(memory, "get_topic_in_range", topic="/bumper", by="value", **window)
+    assert [row[:3] for row in held["rows"]] == [["true", 1, 580.0]]
+    by_hour = ask(**true, by="hour")
+    assert by_hour["all"][by_hour["columns"].index("seconds") - 1] == 580
+    assert [row["duration_s"] for row in ask(**true)["sightings"]] == [0, 20, 20, 20, 20]
+    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    [driven_so] = ask(**driven, **{"while": true})["sightings"]
+    assert driven_so["duration_s"] == 580
 
 
 @each_way
