@@ -48,6 +48,8 @@ _END_OF_DAY: Final = re.compile(r"(?<=[T ])24:00(?::00)?(?![:.,0-9])")
 """Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
 _MIDNIGHT: Final = re.compile(r"24(?::?00){1,2}")
 """The same without a date."""
+_ONE_DIGIT: Final = re.compile(r"^(?=\d(?!\d))")
+"""The begin of an hour such as 9:30."""
 _BETWEEN_HOURS: Final = re.compile("-|to|and|,")
 _LONGEST_TIME: Final = 64
 _DATE_CHARS: Final = len("2026-11-20")
@@ -184,7 +186,7 @@ def hours_from_text(text: str) -> tuple[clock_time, clock_time]:
     """
     parts = _BETWEEN_HOURS.split(text) if len(text) <= _LONGEST_TIME else ()
     try:
-        begin, end = (part.strip() for part in parts)
+        begin, end = (_ONE_DIGIT.sub("0", part.strip()) for part in parts)
         if _MIDNIGHT.fullmatch(end):
             end = "00:00"
         first, last = clock_time.fromisoformat(begin), clock_time.fromisoformat(end)

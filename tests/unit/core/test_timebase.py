@@ -131,6 +131,8 @@ def test_any_text_is_a_finite_time_or_refused(text: str) -> None:
         (" 07:05 to 24:00 ", (7, 5), (0, 0)),
         ("2330, 01:00", (23, 30), (1, 0)),
         ("00:00 and 24:00:00", (0, 0), (0, 0)),
+        ("0:00-23:59", (0, 0), (23, 59)),
+        ("7:05 to 9", (7, 5), (9, 0)),
     ],
 )
 def test_hours_are_read_as_people_write_them(
