@@ -20,14 +20,15 @@ from ros2_memory.core.arrays import (
     Flags,
     Ints,
     joined_codes,
+    numbered,
     range_numbers,
     sorted_codes,
     stable_order,
 )
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,6 +40,7 @@ THINNED_NS: Final = 7 * NS_PER_S
 FLICKER_NS: Final = 3 * NS_PER_S
 """An object that is missed for less time has not left."""
 USUAL_PERIODS: Final = 3
+_FEWEST_ONCE: Final = 3
 SHORT_NS: Final = NS_PER_S
 
 ROW: Final = np.dtype(
@@ -148,6 +150,20 @@ class IntervalTable(NamedTuple):
         by_length = self._by_length()
         _, longest = np.unique(self._array["label"][by_length], return_index=True)
         return self._select(np.sort(by_length[longest]))
+
+    def seen_once(self, key_of: Callable[[str], str], within: Ns) -> IntervalTable:
+        """Returns the intervals of the keys of labels that were seen within one short time alone.
+
+        They have `_FEWEST_ONCE` messages or more: detectors are wrong now and then.
+        """
+        rows = self._array
+        names, codes = numbered(map(key_of, self.labels))
+        keys = codes[rows["label"]]
+        first, last = np.full(len(names), MAX_NS), np.full(len(names), MIN_NS)
+        np.minimum.at(first, keys, rows["first"])
+        np.maximum.at(last, keys, rows["last"])
+        is_once = first + within >= last
+        return self._select(is_once[keys] & (rows["count"] >= _FEWEST_ONCE))
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """Returns the labels seen at their usual rate all the time from `start` to `end`."""

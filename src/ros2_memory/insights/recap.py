@@ -29,7 +29,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.spans import united as united_spans
 from ros2_memory.core.text import Quoted, counted, listed, repeating
-from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_HOUR, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     deleted_between,
@@ -39,6 +39,7 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
     seconds,
+    shown_span,
     unexcluded,
 )
 from ros2_memory.history.held_values import breaks_of, deletions, is_latched
@@ -68,6 +69,7 @@ from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
 from ros2_memory.places.where import heard_times, known_track_for, parse_where
 from ros2_memory.results import Before, Event, PastChange, Recap
+from ros2_memory.things.labels import Labels
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -103,6 +105,9 @@ _PLURALS: Final = {
     "thing": "sightings",
 }
 """The kinds of events, the most important first, and the words for several of each."""
+_MOST_RARE: Final = 3
+"""So many things that were seen once in a long record are listed."""
+_LONG_RECORD_NS: Final = 48 * NS_PER_HOUR
 _KINDS: Final = tuple(_PLURALS)
 _OF_ROBOT: Final = frozenset({"error", "stop", "flip", "drop"})
 """The kinds of events that name the place where the robot was."""
@@ -218,12 +223,14 @@ class _Happened(NamedTuple):
 
     Attributes:
         events: the events, but for short stops and sightings of which there are more than enough.
+        rare: those among them that happened once in a long record.
         counts: by kind, how many there were.
         throughout: the labels that were in view all the time.
         longest_sights: the longest sight of each other label, in order of time.
     """
 
     events: Sequence[Event]
+    rare: Collection[Event]
     counts: Counter[str]
     throughout: Collection[str]
     longest_sights: Sequence[Event]
@@ -250,7 +257,7 @@ def _what_happened(
     events = [
         *_stop_events(nsmallest(most, stops, key=lambda stop: -stop.length), places),
         *_reported_events(view, window, topics, region_stays),
-        *things.events,
+        *dict.fromkeys([*things.events, *things.rare]),
         *_recording_events(view, window, drive),
         *(_goal_event(goal, start, drive.elapsed) for goal in goals),
     ]
@@ -258,7 +265,7 @@ def _what_happened(
         events = [event for event in events if region_stays.contains(event)]
     counts = Counter(event.kind for event in events)
     counts["thing"], counts["stop"] = things.total, len(stops)
-    return _Happened(events, counts, things.throughout, things.longest_of_each)
+    return _Happened(events, things.rare, counts, things.throughout, things.longest_of_each)
 
 
 def _shown_events(
@@ -274,7 +281,8 @@ def _shown_events(
     counts = happened.counts
     kinds = [kind for kind in counts if with_sights or kind != "thing"]
     events = [event for event in happened.events if event.kind in kinds]
-    shown = _most_important(view, events, Counter({kind: counts[kind] for kind in kinds}), most)
+    counted_kinds = Counter({kind: counts[kind] for kind in kinds})
+    shown = _most_important(view, events, counted_kinds, most, happened.rare)
     return [
         replace(
             event,
@@ -468,12 +476,14 @@ class _ThingsInView(NamedTuple):
 
     Attributes:
         events: the things that were seen longest.
+        rare: the longest of those that were seen once in a long record.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
         longest_of_each: the longest sight of each other label, in order of time.
     """
 
     events: list[Event]
+    rare: list[Event]
     total: int
     throughout: set[str]
     longest_of_each: list[Event]
@@ -517,12 +527,22 @@ def _things_in_view(
         throughout = set()
         things = things.during([stay.span for stay in region_stays.stays])
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
+    rare = IntervalTable()
+    if region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS:
+        rare = things.seen_once(Labels(view.limits.labels).key, NS_PER_HOUR).longest_of_each()
     return _ThingsInView(
         [_sight_event(interval, last_seen) for interval in things.longest(most)],
+        [_sight_event(interval, last_seen) for interval in rare.longest(_MOST_RARE)],
         things.size,
         throughout,
         [_sight_event(interval, last_seen) for interval in longest_of_each],
     )
+
+
+def _recorded_for(view: View, window: TimeWindow) -> Ns:
+    """Returns for how long (ns) something was recorded in a window."""
+    first, last = shown_span(view.snapshot, window)
+    return last - first - length_in([*recording_gaps(view, window)], first, last)
 
 
 def _sight_event(interval: VisibleInterval, last_seen: Mapping[str, Ns]) -> Event:
@@ -720,18 +740,20 @@ def _boolean_of(event: Event) -> str:
 
 
 def _most_important(
-    view: View, events: Sequence[Event], counts: Counter[str], most: int
+    view: View, events: Sequence[Event], counts: Counter[str], most: int, rare: Collection[Event]
 ) -> list[Event]:
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
     What happens on any day comes last, the rare before the frequent: two changes of an emergency
     stop, then the stops, then a door that opens all the time. `counts` has how many there are of
-    each kind; there may be more than `events`. A note says how many are left out; one alone is not.
+    each kind; there may be more than `events`. The `rare` ones displace only what happened more
+    often than there may be of them. A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))
 
     def rank(event: Event) -> tuple[int, int, int, Ns]:
         kind, often = _KINDS.index(event.kind), alike[_boolean_of(event) or event.kind]
+        often = min(often, _MOST_RARE) if event in rare else often
         lasted = (event.end or event.start) - event.start
         return min(kind, _OF_ANY_DAY), often, kind, -lasted
 

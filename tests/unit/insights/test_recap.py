@@ -297,6 +297,31 @@ def test_of_many_stops_and_toggles_the_rare_are_listed_first(tmp_path: Path) -> 
     assert f"{34 - (MOST_EVENTS - 2)} stops, {34 * 8 // 3} on/off changes" in left_out
 
 
+@pytest.mark.parametrize(("hours", "is_listed"), [(60, True), (40, False)])
+def test_a_thing_that_was_seen_once_in_days_is_listed_beside_what_happens_all_the_time(
+    tmp_path: Path, hours: int, is_listed: bool
+) -> None:
+    """Each hour a door toggles, and cups or mugs are seen; after 20 hours a deer, and a ghost."""
+
+    def seen(hour: int, second: int, *labels: str) -> Msg:
+        return detections(BEGIN + (3600 * hour + second) * S, labels)
+
+    told = [odom(BEGIN + 60 * minute * S, 0.0) for minute in range(60 * hours)]
+    told += [boolean(BEGIN + 3600 * hour * S + 1, hour % 2 == 1, "/door") for hour in range(hours)]
+    for hour in range(hours):
+        label = "Cup" if hour == 5 else "cup"
+        told += [seen(hour, second, label, "chair") for second in range(100, 140, 2)]
+    told += [seen(20, second, "deer") for second in range(2000, 2010, 2)]
+    told += [seen(20, 2500, "ghost")]
+    write_splits(tmp_path, in_order(told), 3600)
+    told_of = over(memory_of(tmp_path), 0, 3600 * hours)
+    texts = [event.text for event in told_of.events]
+    assert [text for text in texts if "view" in text and "cup" not in text.lower()] == (
+        ["deer in view"] * is_listed
+    )
+    assert (len(texts), "Cup in view" in texts) == (MOST_EVENTS, False)
+
+
 def test_a_path_that_begins_or_ends_within_a_window_says_when_there_are_no_poses(
     tmp_path: Path,
 ) -> None:
