@@ -654,6 +654,8 @@ class RecordingScreen:
         end: the log time of its last message that was read; None before one was read.
         heard: for each rule the values of its topic's condition, in the order of writing.
         unclear: spans of log time in which the clock was set back, so that the order is unknown.
+        holding: for each rule, by the source (`facts.source_of`) of messages that last met its
+            condition, the log time of the newest of them.
     """
 
     done: StrictBool = False
@@ -662,6 +664,7 @@ class RecordingScreen:
     files: dict[str, FileStep] = field(default_factory=dict)
     heard: dict[str, list[ConditionInterval]] = field(default_factory=dict)
     unclear: list[_Span] = field(default_factory=list)
+    holding: dict[str, dict[str, Int64]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)

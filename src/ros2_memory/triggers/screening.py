@@ -24,6 +24,7 @@ from itertools import pairwise, starmap
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.conditions import Equals, leaves
+from ros2_memory.analysis.facts import source_of
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE, bags_in, split_number
@@ -89,11 +90,12 @@ class _UselessRuleError(EpisodicError):
 class _TestResult(NamedTuple):
     """Whether a condition holds; None if the message cannot show it.
 
-    `refusal` is the reason if no message of this type could show it.
+    `refusal` is the reason if no message of this type could show it, `source` whose message it is.
     """
 
     holds: bool | None
     refusal: str | None = None
+    source: str = ""
 
 
 @dataclass(eq=False, repr=False)
@@ -314,18 +316,20 @@ class Screening:
             raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return
-        heard_by_rule = deepcopy(screen.heard)
+        heard_by_rule, holding = deepcopy((screen.heard, screen.holding))
         for rule in self.rules:
             heard = heard_by_rule.setdefault(rule.name, [])
             refusal: str | None = None
             for record in self.reader.records(path, (rule.topic,), TimeWindow.everything()):
                 result = self._test(rule, record)
                 refusal = result.refusal or refusal
-                latched = record.channel.latched
-                add_message(heard, record.log_time, result.holds, latched=latched, stale=rule.stale)
+                time, latched = record.log_time, record.channel.latched
+                in_sources = holding.setdefault(rule.name, {})
+                holds = _holds_of_any(in_sources, result, time, MAX_NS if latched else rule.stale)
+                add_message(heard, time, holds, latched=latched, stale=rule.stale)
             if refusal and rule.excludes_unknown and rule.name not in self._evaluated:
                 raise _UselessRuleError(refusal)
-        screen.heard = heard_by_rule
+        screen.heard, screen.holding = heard_by_rule, holding
         # Latched messages may be written again with the times that they had.
         first_unlatched = min(
             (topic.first for topic in summary.topics if not topic.latched), default=MAX_NS
@@ -350,7 +354,7 @@ class Screening:
             return _TestResult(None, self._refuse(rule, f"{rule.topic}: {refusal}"))
         self._refusals.pop(rule.name, None)
         self._evaluated.add(rule.name)
-        return _TestResult(holds)
+        return _TestResult(holds, source=source_of(value, type_name))
 
     def _refuse(self, rule: ExclusionRule, reason: str) -> str:
         """Stores and returns why a rule cannot be evaluated; logs it every `REMIND_S`."""
@@ -516,6 +520,22 @@ def _joined(spans: Spans) -> Spans:
 
 def _file_name(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
+
+
+def _holds_of_any(
+    holding: dict[str, Ns], result: _TestResult, time: Ns, valid_for: Ns
+) -> bool | None:
+    """Returns whether a condition holds from the next message on; updates `holding`.
+
+    What one source said is not ended by the message of another.
+    """
+    others = (at for source, at in holding.items() if source != result.source)
+    is_held = any(abs(time - at) <= valid_for for at in others)
+    if result.holds:
+        holding[result.source] = time
+    elif result.holds is False:
+        holding.pop(result.source, None)
+    return is_held or result.holds
 
 
 def _refusal_of(condition: Condition, value: JsonValue) -> str | None:

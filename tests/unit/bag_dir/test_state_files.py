@@ -91,8 +91,8 @@ ERASURE = r"""{"format":1,"topics":["/a"],"windows":[[1,2]],"latched":["/\u00e4"
 "files":["f\udcff"],"counts":[{"topic":"/a","start":1,"stop":2,"count":3}]}"""
 SCREEN = """{"format":1,"recordings":{"rec_A":{"done":false,"start":1,"end":null,
 "files":{"a.mcap":"read"},"heard":{"home":[{"first":1,"last":2,"holds":null,"lasts":false}]},
-"unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}],"earlier":[[0,1]],
-"earlier_held":[[0,1]]}"""
+"unclear":[[1,2]],"holding":{"home":{"left":1}}}},"excluded":[{"start":1,"stop":2,"held":true}],
+"earlier":[[0,1]],"earlier_held":[[0,1]]}"""
 RULES = r"""{"format":1,"rules":{"t\u00fcr":{"fired":1,"moments":2,"refused":3,"last_fired":null,
 "problem":"\u00df","unstored":null,"never":null,"always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
 "start":1,"end":2,"matches":1,"known":false,"stored":false}],

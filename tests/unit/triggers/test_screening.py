@@ -20,7 +20,7 @@ from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.triggers import screening
 from ros2_memory.triggers.exclusion import ExclusionRule
-from tests.support.bags import McapLayout, Msg, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, diagnostics, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.fakes import broken
 from tests.support.mcap_surgery import spoil_chunk
@@ -28,6 +28,8 @@ from tests.support.memories import asked, memory_of
 from tests.support.noting_reader import fail_reading
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, off, on, privacy, word, words
 from tests.support.simulated_recorders import events
+
+LATCHED_DIAGNOSTICS = McapLayout(latched=frozenset({"/diagnostics"}))
 
 
 @pytest.fixture
@@ -73,6 +75,26 @@ def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
     bags.split(bags.begin(0), said, McapLayout(latched=frozenset()))
     bags.end()
     assert bags.seconds() == halves(0, 6)
+
+
+@pytest.mark.parametrize("layout", [McapLayout(latched=frozenset()), LATCHED_DIAGNOSTICS])
+def test_what_other_nodes_report_does_not_end_what_one_excludes(
+    tmp_path: Path, layout: McapLayout
+) -> None:
+    """The camera is private from 5 to 14 s, over two splits; the lidar reports between."""
+    private = parse_condition("contains", "private", 0.5)
+    camera = privacy(topic="/diagnostics", condition=private, margin=0)
+    bags = ScreenedBags(tmp_path / "bags", camera)
+    name = bags.begin(0)
+    for begin in (0, 10):
+        said = words(begin, begin + 10)
+        for second in range(begin, begin + 10):
+            at, state = T0 + second * S, "private" if 5 <= second < 15 else "open"
+            said += [diagnostics(at, camera=(0, state)), diagnostics(at + 1000, lidar=(0, "fine"))]
+        bags.split(name, said, layout)
+        bags.step()
+    bags.end()
+    assert bags.seconds() == [*halves(0, 5), *halves(15, 20)]
 
 
 def test_a_split_is_held_back_while_a_late_message_may_exclude_its_end(tmp_path: Path) -> None:
