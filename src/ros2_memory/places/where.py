@@ -27,7 +27,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, Storey, contains
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import recording_gaps, span_text, unknown_times
@@ -463,7 +463,8 @@ class _ConditionStates:
     """When the newest message of some topics met a condition.
 
     Messages are tested bag by bag, those around the time that is asked about, by their columns. So
-    it is quick to ask about times from the newest to the oldest.
+    it is quick to ask about times from the newest to the oldest. Of one long time they are tested
+    hour by hour.
     """
 
     def __init__(self, view: View, during: Sought) -> None:
@@ -487,6 +488,7 @@ class _ConditionStates:
         self._read = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._met: list[bool] = []
+        self._wanted_to: Ns = MIN_NS
 
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when it is known what the topics said.
@@ -533,13 +535,14 @@ class _ConditionStates:
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time in which the condition holds, in order; ends are inclusive."""
-        time = first
+        time, self._wanted_to = first, last
         while time <= last:
             until = time
             if self.holds_at(time):
                 until = self.holds_until(time, last)
                 yield time, until
             time = MAX_NS if until == last else self._next_after(until, last)
+        self._wanted_to = MIN_NS
 
     def _next_after(self, time: Ns, end: Ns) -> Ns:
         """Returns the log time of the first message after a time that was read around.
@@ -554,12 +557,12 @@ class _ConditionStates:
         return MAX_NS if message is None else message.time
 
     def _read_around(self, time: Ns) -> None:
-        """Reads the bags that may hold the newest message at a log time."""
+        """Reads the bags that may hold the newest message at a log time, and ahead if wanted."""
         topics = self.search.topics
         spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
         start = min((span.first for span in spans), default=time)
         stop = max((span.last + 1 for span in spans), default=time + 1)
-        stop = max(stop, time + 1)
+        stop = max(stop, time + 1, min(self._wanted_to + 1, time + NS_PER_HOUR))
         times, met = self._tested(TimeWindow(start, stop))
         if not times or times[0] > start:
             before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)

@@ -146,6 +146,23 @@ def test_metres_and_visits_while_a_topic_meets_a_condition_are_those_of_that_tim
             assert rows["all"]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
 
 
+def test_what_was_driven_while_a_topic_said_so_takes_a_few_searches_of_many_bags(
+    tmp_path: Path,
+) -> None:
+    """One by one, the bags of a day took as many searches as there were."""
+    messages = []
+    for nth in range(1200):
+        flag = boolean(T0 + nth * S + 1, nth // 100 % 2 == 0)
+        messages += [odom(T0 + nth * S, nth / 100, 0.0), flag]
+    write_splits(tmp_path, messages, 10)
+    reader = NotingReader()
+    memory = memory_of(tmp_path, reader=reader, recalls=True)
+    span = {"start": T0 // S, "end": T0 // S + 1200, "while": CARRYING}
+    reader.asked.clear()
+    assert asked(memory, "trajectory_summary", **span)["duration_s"] == pytest.approx(600, abs=2)
+    assert sum("/bumper" in topics for _, topics in reader.asked) < 20
+
+
 @pytest.mark.parametrize(
     ("name", "given"), [("trajectory_summary", {}), ("visits", {"x": 0, "y": 0})]
 )
