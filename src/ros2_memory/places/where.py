@@ -408,7 +408,8 @@ def counted_stays(view: View, where: Where | None, scope: Scope, path: Span) -> 
     """Returns the parts of each of the robot's stays in a place that lie in a scope, in order.
 
     Without a place all of its path, from the first to the last log time, is one stay, but for gaps
-    of the recording. Stays without such a part are left out; all ends are inclusive.
+    of the recording that end a stay in a place, too. Stays without such a part are left out; all
+    ends are inclusive.
 
     Raises:
         InvalidArgumentsError, NoDataError, QueryTimeoutError: as `known_track_for` does.
@@ -416,7 +417,8 @@ def counted_stays(view: View, where: Where | None, scope: Scope, path: Span) -> 
     window = scope.window
     if where is None:
         first, last = path
-        recorded = without([(first, last + 1)], united(recording_gaps(view, window)))
+        gaps = [gap for gap in recording_gaps(view, window) if gap[1] - gap[0] > SILENCE_NS]
+        recorded = without([(first, last + 1)], united(gaps))
         spans = [(start, stop - 1) for start, stop in recorded]
     else:
         track = known_track_for(view, where, window).track
