@@ -480,20 +480,20 @@ def count_values(
         raise no_value_between(view, topic, field, asked)
     view.notes.add(*names_of_numbers(view, topic, field, {value.word for value in held_values}))
     outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
-    named_rows = _value_rows(held_values, view.elapsed_in(asked), united(outside), condition)
-    if len(named_rows) > _MOST_VALUES:
-        more = counted(len(named_rows) - _MOST_VALUES, "value")
+    valued_rows = _value_rows(held_values, view.elapsed_in(asked), united(outside), condition)
+    if len(valued_rows) > _MOST_VALUES:
+        more = counted(len(valued_rows) - _MOST_VALUES, "value")
         view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")
     note_unread(view, asked)
     note_robots(view, topic, asked)
-    rows = [row for _, row in named_rows]
+    rows = [row for _, row in valued_rows]
     return Bins(
         by="value",
         about=(topic,),
         start=start,
         end=stop - 1,
         columns=HELD_COLUMNS,
-        rows=tuple(named_rows[:_MOST_VALUES]),
+        rows=tuple((_name_of(held), row) for held, row in valued_rows[:_MOST_VALUES]),
         all=(
             sum(row.occurrences for row in rows),
             sum(row.length for row in rows),
@@ -524,8 +524,8 @@ def _held_since(
 
 def _value_rows(
     held_values: Sequence[HeldValue], elapsed: Elapsed, outside: Spans, condition: Condition | None
-) -> list[tuple[str, _ValueRow]]:
-    """Returns each value that counts with its row, the one that held longest first.
+) -> list[tuple[HeldValue, _ValueRow]]:
+    """Returns each value that counts, when it first held, with its row, the longest first.
 
     Time that lies in the spans `outside` adds nothing to a length.
     """
@@ -537,9 +537,14 @@ def _value_rows(
         first, last = times[0], times[-1]
         if first.is_blank or (condition and not condition.matches({"value": first.exact})):
             continue
-        value = first.value
-        text = value if isinstance(value, str) else json.dumps(value)
         length = elapsed.among(without([(held.start, held.stop) for held in times], outside))
         row = _ValueRow(len(times), length, first.start, last.stop)
-        rows.append((Quoted(shortened(text, _LONGEST_NAME)), row))
-    return sorted(rows, key=lambda named_row: (-named_row[1].length, named_row[1].first))
+        rows.append((first, row))
+    return sorted(rows, key=lambda valued_row: (-valued_row[1].length, valued_row[1].first))
+
+
+def _name_of(held: HeldValue) -> str:
+    """Returns the name of the row of a value."""
+    value = held.value
+    text = value if isinstance(value, str) else json.dumps(value)
+    return Quoted(shortened(text, _LONGEST_NAME))

@@ -94,8 +94,7 @@ class HeldValue(NamedTuple):
     @property
     def is_blank(self) -> bool:
         """Whether it is a text without words: it only ends the value before."""
-        value = self.value
-        return isinstance(value, str) and not value.strip()
+        return self.word.startswith('"') and not str(self.exact).strip()
 
 
 class _Run(NamedTuple):
