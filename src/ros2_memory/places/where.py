@@ -65,7 +65,7 @@ PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 _EXPECTED: Final = (
     "give the name of a place, "
     '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m), of one storey with '
-    '"z": [2, 4]; '
+    '"z": [2, 4], or [2, null]; '
     'several as "kitchen, hall", or by name: {"kitchen": {"x": [0, 5], "y": [5, 9]}, "hall": ...}'
 )
 _REGION_KEYS: Final = frozenset({"x", "y", "z", "radius_m"})
@@ -225,8 +225,10 @@ def _region_of(value: JsonValue, default_radius_m: float | None) -> Region | Non
     if plan is None or heights is None:
         return plan
     match heights:
-        case [bottom, top] if -math.inf < as_float(bottom) < as_float(top) < math.inf:
-            return Storey(plan, as_float(bottom), as_float(top))
+        case [bottom, top]:
+            low = -math.inf if bottom is None else as_float(bottom)
+            high = math.inf if top is None else as_float(top)
+            return Storey(plan, low, high) if low < high else None
     return None
 
 

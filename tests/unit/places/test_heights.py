@@ -76,7 +76,14 @@ def test_a_question_may_ask_about_coordinates_at_some_heights(memory: Memory) ->
         for key in ("total", "inside_s", "minutes"):
             assert reply.get(key) == named.get(key), (tool, key)
     assert asked(memory, "recap", where=up, start=BEGIN, end=END)["where"] == up
-    for heights in (2.0, [3.0], [3, 2], ["a", "b"]):
+    above = plan | {"z": [2.0, None]}
+    assert asked(memory, "recap", where=above, start=BEGIN, end=END)["where"] == above
+    assert (
+        asked(memory, "visits", where=above)["total"] == asked(memory, "visits", where=up)["total"]
+    )
+    below = asked(memory, "find_things", where=plan | {"z": [None, 2]})
+    assert below["things"] == asked(memory, "find_things", where="kitchen")["things"]
+    for heights in (2.0, [3.0], [3, 2], ["a", None], ["a", "b"]):
         refused = asked(memory, "visits", where=plan | {"z": heights})
         assert '"z": [2, 4]' in refused["detail"]
 
