@@ -1,7 +1,8 @@
 """When a detector was blind: in the dark, or with its lens covered, it publishes empty messages.
 
 From most poses a detector always sees something. Where it reports nothing at all although it looks
-at several of these, or all that it saw is gone from one moment to the next, nothing was taken away.
+at several of these, or far along a wall, or all that it saw is gone from one moment to the next,
+nothing was taken away.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from ros2_memory.analysis.sights import NO_YAW, Hit, Look, Spot
 from ros2_memory.core.arrays import (
     Columns,
+    Groups,
     Ints,
     distinct_rows,
     entries_of_codes,
@@ -34,10 +36,12 @@ _LABELS_MISSED: Final = 3
 """Fewer things may have been taken away together."""
 _LABELS_OF_VIEW: Final = 2
 """A view in which so many labels are usual is compared with others."""
-_LOOKS_OF_USUAL: Final = 3
+_TIMES_OF_USUAL: Final = 3
 """What was seen less often from a cell is not usual there."""
 _SHARE_OF_USUAL: Final = 0.5
-"""What is usual is in such a share of the looks from its cell that saw anything."""
+"""What is usual is in such a share of the messages of looks from its cell that saw anything."""
+_FAR_MM: Final = 10_000.0
+"""Things of a label that are usual in views so far apart were not taken away together."""
 _OTHER_VIEW_MM: Final = 1000.0
 _OTHER_VIEW_DEG: Final = 60.0
 _AT_ONCE_NS: Final = 20 * NS_PER_S
@@ -99,22 +103,33 @@ class _Views:
         look, n, label = (column[look >= 0] for column in (look, n, label))
         self.most_hits = np.zeros(len(cells.slice), np.int64)
         np.maximum.at(self.most_hits, look, n)
-        seen, _ = distinct_rows([look[stays[label]], label[stays[label]]])
+        seen, number = distinct_rows([look[stays[label]], label[stays[label]]])
+        most = np.zeros(len(seen), np.int64)
+        np.maximum.at(most, number, n[stays[label]])
         self._labels_in_look = np.bincount(seen[:, 0], minlength=len(cells.slice))
         seen_from, number = distinct_rows([cells.cell[seen[:, 0]], seen[:, 1]])
-        times = np.bincount(number, minlength=len(seen_from))
-        seeing = cells.cell[self._labels_in_look > 0]
-        seeing_looks = np.bincount(seeing, minlength=len(cells.looks_in))[seen_from[:, 0]]
-        is_usual = times >= np.maximum(_SHARE_OF_USUAL * seeing_looks, _LOOKS_OF_USUAL)
+        times = np.bincount(number, most, len(seen_from))
+        seeing = self._labels_in_look > 0
+        messages = np.bincount(cells.cell[seeing], cells.n[seeing], len(cells.looks_in))
+        least = np.maximum(_SHARE_OF_USUAL * messages[seen_from[:, 0]], _TIMES_OF_USUAL)
+        is_usual = times >= least
         self._usual_cells, self._usual_labels = seen_from[is_usual].T
         self._cells = cells
 
     def lack_usual(self, looks: Ints) -> bool:
         """Returns whether looks that saw nothing are from several views with usual labels."""
         cells = self._cells
-        of_looks, row_of = np.unique(cells.cell[looks], return_inverse=True)
+        of_looks, first, row_of = np.unique(
+            cells.cell[looks], return_index=True, return_inverse=True
+        )
         counts, rows = entries_of_codes(self._usual_cells, of_looks)
-        if len(np.unique(self._usual_labels[rows])) < _LABELS_MISSED:
+        usual, label = np.unique(self._usual_labels[rows], return_inverse=True)
+        by, seen_from = Groups.of(label), np.repeat(looks[first], counts)
+        ends = (by.ends(axis[seen_from].astype(np.int64)) for axis in (cells.x, cells.y))
+        far = np.hypot(*(most - least for least, most in ends)) >= _FAR_MM
+        if far.any() and len(usual) + np.count_nonzero(far) >= _LABELS_MISSED:
+            return True
+        if len(usual) < _LABELS_MISSED:
             return False
         looks = looks[counts[row_of] >= _LABELS_OF_VIEW]
         x, y, heading = cells.x[looks], cells.y[looks], cells.heading(looks)

@@ -81,10 +81,15 @@ _MOVES_BY_ITSELF: Final = frozenset(
         "cattle",
         "cow",
         "deer",
+        "diver",
+        "fish",
+        "fish school",
         "fox",
         "goat",
         "horse",
         "sheep",
+        "shoal",
+        "swimmer",
         "wolf",
     }
 )
@@ -116,8 +121,8 @@ def unspaced(key: str) -> str:
 
 
 def moves_by_itself(key: str) -> bool:
-    """Returns whether a key names people, pets, or animals of fields and woods."""
-    return key not in _NO_ANIMALS and last_word(key) in _MOVES_BY_ITSELF
+    """Returns whether a key names people, pets, or animals of fields, woods and waters."""
+    return key not in _NO_ANIMALS and not _MOVES_BY_ITSELF.isdisjoint((key, last_word(key)))
 
 
 def _singular(word: str) -> str:

@@ -932,6 +932,47 @@ def test_in_the_dark_nothing_is_missed(tmp_path: Path, later: list[Seen]) -> Non
     assert blind in compared["notes"]
 
 
+ALONG_THE_WALL: list[Seen] = [
+    ("anode", 2.0, 0.0),
+    ("crack", 8.0, 0.0),
+    ("anode", 14.0, 0.0),
+    ("crack", 20.0, 0.0),
+]
+
+
+def passes(*seen: list[Seen]) -> list[Msg]:
+    """The robot stands half a minute before each place of the wall, and so on."""
+    poses = [(x - 1.5, 0.0, 0.0) for _, x, _ in ALONG_THE_WALL]
+    return [
+        message
+        for nth, things in enumerate(seen)
+        for pose, start in zip(poses, count(200 * nth, 30))
+        for message in looked(
+            start, start + 30, pose, *(thing for thing in things if thing[1] == pose[0] + 1.5)
+        )
+    ]
+
+
+@pytest.mark.parametrize("later", [ALONG_THE_WALL, []], ids=["light again", "still dark"])
+def test_in_black_water_what_is_alone_in_view_along_a_wall_is_not_missed(
+    tmp_path: Path, later: list[Seen]
+) -> None:
+    """One label is in each view, and two in all: things so far apart go not together either."""
+    reply = told_of(tmp_path, passes(ALONG_THE_WALL, [], later))
+    assert reply["labels"] == {"anode": 2, "crack": 2}
+    assert not any("moved_times" in thing for thing in reply["things"])
+    assert "not_seen_where_expected" not in str(reply["things"])
+    assert "was blind from" in str(reply["notes"])
+
+
+def test_two_of_one_label_that_were_taken_away_far_apart_are_missed(tmp_path: Path) -> None:
+    pallets = [("pallet", 2.0, 0.0), ("pallet", 14.0, 0.0)]
+    reply = told_of(tmp_path, passes(pallets, pallets, []))
+    states = [thing["still_there"] for thing in reply["things"]]
+    assert len(states) == 2
+    assert all("not_seen_where_expected" in state for state in states)
+
+
 def test_what_was_taken_away_one_by_one_is_missed_on_an_empty_bench(tmp_path: Path) -> None:
     messages = [
         *looked(0, 30, HERE, *BENCH),

@@ -192,9 +192,12 @@ def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
         ("dog", True),
         ("small dog", True),
         ("roe deer", True),
+        ("fish school", True),
+        ("diver", True),
         ("hot dog", False),
         ("dog bed", False),
         ("rocking horse", False),
+        ("school", False),
     ],
 )
 def test_people_and_animals_move_by_themselves_and_food_does_not(key: str, *, moves: bool) -> None:
