@@ -382,8 +382,9 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
 
     Its columns are those of `DetectorMessages.robot`.
 
-    If there is no pose, it follows from the transforms of the frames that carry the detector. A
-    message without a frame is taken to be in the frame of most detections.
+    It follows from the transforms of the frames that carry the detector, which are looked up by
+    stamps as its detections are; without them, from the poses, which have log times. A message
+    without a frame is taken to be in the frame of most detections.
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
     ahead_and_upright = np.tile((0.0, 0.0, 0.0, 1.0), (len(times), 1))
@@ -403,7 +404,7 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         yaw = _yaw(body.rotation)
         by_body = np.stack((*body.translation, yaw), axis=1)
         by_body = np.where(body.valid[:, None], by_body, math.nan)
-        robot[rows, :4] = np.where(np.isnan(robot[rows, :4]), by_body, robot[rows, :4])
+        robot[rows, :4] = np.where(np.isnan(by_body), robot[rows, :4], by_body)
         robot[rows, 5:] = np.where(head.valid[:, None], _up(head.rotation), robot[rows, 5:])
         head_frame, body_frame = carriers
         if head_frame != body_frame:

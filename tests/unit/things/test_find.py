@@ -965,6 +965,20 @@ def test_in_black_water_what_is_alone_in_view_along_a_wall_is_not_missed(
     assert "was blind from" in str(reply["notes"])
 
 
+def test_a_robot_whose_clock_is_behind_the_recorders_saw_things_from_where_it_was(
+    tmp_path: Path,
+) -> None:
+    """It drives past a cup with stamps 1.6 s behind the log times, which agree well enough."""
+    poses = [(nth / 5, (nth / 10, 0.0, 0.0)) for nth in range(40)]
+    drive = [message for at, pose in poses for message in scene(at, pose, [("cup", 6.0, 0.0)])]
+    late = [replace(message, log_time=message.log_time + 16 * S // 10) for message in drive]
+    seen_from = [
+        told_of(tmp_path / name, messages)["things"][0]["seen_from"]
+        for name, messages in (("one clock", drive), ("two", late))
+    ]
+    assert seen_from[1] == seen_from[0]
+
+
 def test_two_of_one_label_that_were_taken_away_far_apart_are_missed(tmp_path: Path) -> None:
     pallets = [("pallet", 2.0, 0.0), ("pallet", 14.0, 0.0)]
     reply = told_of(tmp_path, passes(pallets, pallets, []))
