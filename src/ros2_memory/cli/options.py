@@ -148,7 +148,7 @@ def load_to_look(
     named, settings_words = settings_to_look(bag_dir, words, recording)
     settings = load_for(named, settings_words)
     folder = settings.recording.bag_dir
-    if named is None and not is_deployment_chosen(settings_words) and not has_recorded(folder):
+    if named is None and not _is_chosen(settings_words) and not has_recorded(folder):
         has_bags = folder.is_dir() and next(folders_with_bags(folder), None) is not None
         if has_bags:
             return load_for(None, [*LOOKING, *settings_words])
@@ -178,7 +178,7 @@ def settings_to_look(
             raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
         bag_dir = folder
     if bag_dir is not None and not _is_recorded_now(bag_dir):
-        is_chosen = is_deployment_chosen(settings)
+        is_chosen = _is_chosen(settings)
         if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in settings):
             deployed = load_for(None, settings)
             is_chosen = bag_dir.absolute() == deployed.recording.bag_dir.absolute()
@@ -187,6 +187,11 @@ def settings_to_look(
     if recording is not None:
         settings.append(f"data.recording={quoted(recording)}")
     return bag_dir, settings
+
+
+def _is_chosen(words: Sequence[str]) -> bool:
+    """Returns whether a deployment is chosen otherwise than by what `LOOKING` has anyway."""
+    return is_deployment_chosen([word for word in words if word not in LOOKING])
 
 
 def _is_recorded_now(bag_dir: Path) -> bool:

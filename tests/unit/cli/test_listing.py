@@ -353,6 +353,15 @@ def test_tools_take_a_path_before_them_and_times_in_words(exits: Program) -> Non
     assert "'soon' is not a time" in exits(2, "ask recap b start=soon").err
 
 
+@pytest.mark.usefixtures("folder")
+def test_a_path_is_read_alike_with_recorder_none_as_nothing_records_there_anyway(
+    exits: Program,
+) -> None:
+    """Else "ago" counted from the wall clock, and no .db3 was read."""
+    ago = "ask b get_position_seconds_ago --json seconds_ago=2"
+    assert exits(0, f"{ago} recorder=none").json == exits(0, ago).json
+
+
 def test_a_folder_whose_name_has_an_equals_sign_is_no_argument(
     folder: Path, exits: Program
 ) -> None:
