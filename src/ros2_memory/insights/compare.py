@@ -422,6 +422,10 @@ class _ThingsBetween:
             return stay is not None
         return self.where.contains(self.known.frames[instance.epoch], stay.part.place)
 
+    def _is_blind(self, time: Ns) -> bool:
+        """Returns whether a detector was blind at a time, which later sights may have shown."""
+        return any(blind.first <= time <= blind.last for blind in self.known.by_all.estimate.blind)
+
     def _difference(
         self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
     ) -> tuple[_Kind, ComparedThing]:
@@ -435,7 +439,8 @@ class _ThingsBetween:
         if before is None and after is not None:
             window = self.earlier.start, min(self.earlier.stop, self.later.start)
             _, missed = estimate.missing(instance, after.stay, window)
-            return "not_looked_at" if missed is None else "appeared", thing
+            was_looked_at = missed is not None and not self._is_blind(missed)
+            return "appeared" if was_looked_at else "not_looked_at", thing
         if before is not None and after is None:
             # Its last stay at the same place before the later window.
             *_, last_there = (
@@ -444,7 +449,7 @@ class _ThingsBetween:
                 if stay.place == before.stay.place and stay.first < self.later.start
             )
             looks, missed = estimate.missing(instance, last_there)
-            if missed is None or missed >= self.later.stop:
+            if missed is None or missed >= self.later.stop or self._is_blind(missed):
                 return "not_looked_at", thing
             return "not_seen_where_expected", replace(thing, missed=missed, looks=looks)
         if before is None or after is None:

@@ -1,8 +1,8 @@
 """When a detector was blind: in the dark, or with its lens covered, it publishes empty messages.
 
 From most poses a detector always sees something. Where it reports nothing at all although it looks
-at several of these, or far along a wall, or all that it saw is gone from one moment to the next,
-nothing was taken away.
+at several of these, or at what is there before and after in views far apart, or all that it saw is
+gone from one moment to the next, nothing was taken away.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TIMES_OF_USUAL: Final = 3
 _SHARE_OF_USUAL: Final = 0.5
 """What is usual is in such a share of the messages of looks from its cell that saw anything."""
 _FAR_MM: Final = 10_000.0
-"""Things of a label that are usual in views so far apart were not taken away together."""
+"""What is seen before and after in views so far apart was not taken away, and put back."""
 _OTHER_VIEW_MM: Final = 1000.0
 _OTHER_VIEW_DEG: Final = 60.0
 _AT_ONCE_NS: Final = 20 * NS_PER_S
@@ -114,6 +114,8 @@ class _Views:
         least = np.maximum(_SHARE_OF_USUAL * messages[seen_from[:, 0]], _TIMES_OF_USUAL)
         is_usual = times >= least
         self._usual_cells, self._usual_labels = seen_from[is_usual].T
+        ends = Groups.of(number).ends(cells.looks.first[seen[:, 0]])
+        self._usual_since, self._usual_until = (end[is_usual] for end in ends)
         self._cells = cells
 
     def lack_usual(self, looks: Ints) -> bool:
@@ -123,13 +125,14 @@ class _Views:
             cells.cell[looks], return_index=True, return_inverse=True
         )
         counts, rows = entries_of_codes(self._usual_cells, of_looks)
-        usual, label = np.unique(self._usual_labels[rows], return_inverse=True)
-        by, seen_from = Groups.of(label), np.repeat(looks[first], counts)
-        ends = (by.ends(axis[seen_from].astype(np.int64)) for axis in (cells.x, cells.y))
-        far = np.hypot(*(most - least for least, most in ends)) >= _FAR_MM
-        if far.any() and len(usual) + np.count_nonzero(far) >= _LABELS_MISSED:
+        times = cells.looks.first[looks]
+        is_back = self._usual_since[rows] < times.min()
+        is_back &= self._usual_until[rows] > times.max()
+        seen_from = np.repeat(looks[first], counts)[is_back]
+        sides = (np.ptp(axis[seen_from].astype(np.int64)) for axis in (cells.x, cells.y))
+        if is_back.any() and np.hypot(*sides) >= _FAR_MM:
             return True
-        if len(usual) < _LABELS_MISSED:
+        if len(np.unique(self._usual_labels[rows])) < _LABELS_MISSED:
             return False
         looks = looks[counts[row_of] >= _LABELS_OF_VIEW]
         x, y, heading = cells.x[looks], cells.y[looks], cells.heading(looks)

@@ -953,16 +953,17 @@ def passes(*seen: list[Seen]) -> list[Msg]:
     ]
 
 
-@pytest.mark.parametrize("later", [ALONG_THE_WALL, []], ids=["light again", "still dark"])
-def test_in_black_water_what_is_alone_in_view_along_a_wall_is_not_missed(
-    tmp_path: Path, later: list[Seen]
-) -> None:
-    """One label is in each view, and two in all: things so far apart go not together either."""
-    reply = told_of(tmp_path, passes(ALONG_THE_WALL, [], later))
+def test_in_black_water_what_is_alone_in_view_along_a_wall_is_not_missed(tmp_path: Path) -> None:
+    """What is far apart is not taken away together, and put back."""
+    reply = told_of(tmp_path, passes(ALONG_THE_WALL, [], ALONG_THE_WALL))
     assert reply["labels"] == {"anode": 2, "crack": 2}
     assert not any("moved_times" in thing for thing in reply["things"])
     assert "not_seen_where_expected" not in str(reply["things"])
     assert "was blind from" in str(reply["notes"])
+    windows = {"with_start": BEGIN, "with_end": BEGIN + 150}
+    dark = {"start": BEGIN + 200, "end": BEGIN + 350}
+    compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows, **dark)
+    assert compared["things"].keys() == {"not_looked_at"}
 
 
 def test_a_robot_whose_clock_is_behind_the_recorders_saw_things_from_where_it_was(
