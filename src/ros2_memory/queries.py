@@ -152,6 +152,8 @@ _THINNED_POSES_NS: Final = 3 * NS_PER_S
 _ROUNDING_MPS: Final = 0.01
 _MOST_TRIED: Final = 1000
 """So many poses at most are tried to place one in another frame."""
+_OTHER_CLOCK_NS: Final = NS_PER_S
+"""Stamps of transforms that are so far from log times are those of another computer's clock."""
 _CORRECTED_NS: Final = 2 * NS_PER_S
 """A map is mostly corrected more often."""
 _ENDED_GOALS: Final = (
@@ -600,6 +602,13 @@ def transform(
     except NoDataError as error:
         raise with_notes(view, TimeWindow.around(at, TF_CACHE_NS), error) from error
     note_unread(view, TimeWindow.around(at, transform.around))
+    if transform.clock == "stamp" and abs(transform.late) >= _OTHER_CLOCK_NS:
+        side, age_then = ("before", "older") if transform.late > 0 else ("after", "newer")
+        view.notes.add(
+            f"stamps of transforms are {abs(transform.late) / NS_PER_S:.1f} s {side} log times, as "
+            "of another computer's clock: messages and positions of this time are that much "
+            f"{age_then}"
+        )
     age = None if now is None else now - at
     return results.TransformAt(
         parent, child, at, transform.transform, transform.clock, age, notes=view.notes.sentences()

@@ -311,6 +311,13 @@ class FrameTree:
                 self._pairs[parent, child] = None
         self._histories: dict[str, _History] = {}
 
+    @property
+    def late_ns(self) -> Ns:
+        """The median time from the stamps of moving transforms to their log times (ns)."""
+        edges = [edge for parents in self._moving.values() for edge in parents.values()]
+        late = [edge.log_times - edge.stamps for edge in edges]
+        return int(np.median(np.concatenate(late))) if late else 0
+
     def reaches(self, frame: str) -> bool:
         """Returns whether transforms connect a frame with the target at some time."""
         return frame.lstrip("/") in connected_with(self.target, self._pairs)

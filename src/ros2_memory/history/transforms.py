@@ -76,11 +76,13 @@ class FoundTransform(NamedTuple):
         transform: the transform.
         clock: the clock in which the moment was meant.
         around: how far around the moment (ns) transforms were read.
+        late: how long after their stamps (ns) transforms were logged.
     """
 
     transform: Transform
     clock: TfClock
     around: Ns
+    late: Ns
 
 
 def transform_at(
@@ -187,7 +189,7 @@ def _transform_of_session(
 
     def look_up(moving: Sequence[StampedTransform], reach: Ns = TF_CACHE_NS) -> FoundTransform:
         tree = frames_of(view, static, moving, parent)
-        return FoundTransform(tree.lookup(child, at), tree.clock, reach)
+        return FoundTransform(tree.lookup(child, at), tree.clock, reach, tree.late_ns)
 
     *shorter, longest = _HALF_WIDTHS
     for half_width in shorter:

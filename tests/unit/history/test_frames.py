@@ -87,6 +87,17 @@ def x_of(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> A
     return found.get("reason") or found["translation"]["x"]
 
 
+def test_a_note_says_how_far_stamps_of_transforms_are_from_log_times(tmp_path: Path) -> None:
+    """A robot that drives is elsewhere by get_position_at of the same time."""
+    for name, late in (("one clock", 0), ("two", 16 * S // 10)):
+        driven = moving(T0, 20, "map", "odom", 0.0, 0.5)
+        late_ones = [replace(message, log_time=message.log_time + late) for message in driven]
+        record(tmp_path / name / "rec", late_ones)
+        found = looked_up(memory_of(tmp_path / name), T0 + 10 * S)
+        assert found["translation"]["x"] == 5.0
+        assert ("1.6 s before log times" in str(found.get("notes"))) == bool(late)
+
+
 def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_path: Path) -> None:
     first, second = "rec_20260714T000000Z", "rec_20260714T000001Z"
     for name, x in ((first, 100.0), (second, 500.0)):
