@@ -295,6 +295,17 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
 
 
+def test_a_refusal_names_the_field_that_a_type_of_no_known_velocity_has(tmp_path: Path) -> None:
+    """As that of a Doppler log, which was told to have none."""
+    kind, at = "sensor_msgs/msg/JointState", np.array([0.1])
+    joints = make(
+        kind, header=header(T0, ""), name=["thruster"], position=at, velocity=at, effort=at
+    )
+    memory = remembered(tmp_path, [Msg("/dvl", kind, T0, joints)])
+    refused = asked(memory, "get_velocity_at", timestamp=T0_S + 0.05, topic="/dvl")["detail"]
+    assert "(get_topic_in_range shows its field velocity)" in refused
+
+
 def carried_by(parent: str, begin_s: int, y: float) -> list[Msg]:
     """Half a minute of transforms of the body, driving at 1 m/s."""
     times = [T0 + begin_s * S + n * S // 10 for n in range(301)]

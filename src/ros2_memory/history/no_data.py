@@ -603,8 +603,10 @@ def require_decoded(view: View, stored: StoredMessage) -> object:
 
 def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry `what`, with topics that do."""
-    has = f"carries no {what}"
-    if view.extractor.geodetic(view.bags.decode(stored), stored.type) is not None:
+    has, message = f"carries no {what}", view.bags.decode(stored)
+    if hasattr(message, what):
+        has += f" of a known kind (get_topic_in_range shows its field {what})"
+    if view.extractor.geodetic(message, stored.type) is not None:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
