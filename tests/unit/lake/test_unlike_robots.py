@@ -20,10 +20,11 @@ from ros2_memory.core.memo import Memo
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.joined import JoinedIndex
 from ros2_memory.fleet.robots import Fleet
-from ros2_memory.history.context import Memory
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import LakeReader
 from ros2_memory.lake.shipper import Shipped
+from ros2_memory.tools.build import build_tools
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
 from tests.support.lakes import (
@@ -299,5 +300,6 @@ def every_question(
     yield "visits", {**spot, "by": "hour"}
     yield "visits", {**spot, **whole, "while": match}
     yield "trajectory_summary", {**whole, "while": match}
-    for tool in ("list_recorded_topics", "data_time_range", "list_frames"):
-        yield tool, {}
+    for tool in build_tools(QuerySettings()):
+        if "required" not in tool.schema and tool.name not in OF_DIRECTORIES:
+            yield tool.name, {}
