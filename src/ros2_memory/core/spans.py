@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 """How far apart the log times of one message in two recordings are at most."""
-COPY_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
-"""The same where recorders give a message no publish time but its log time."""
+COPY_JITTER_NS: Final[Ns] = 20 * NS_PER_MS
+"""The same where recorders give a message no publish time but its log time.
+
+Two robots seldom say the same in less."""
 Spans: TypeAlias = list[Span]
 """Sorted and apart, where functions return them."""
 
