@@ -2,10 +2,10 @@
 
 Recordings overlap for some seconds while one takes over from the other. A message that is in both
 has the same publish time and payload in each, and log times that differ by at most
-`COPY_HORIZON_NS`. Some recorders, as those of Humble, write the log time as publish time: then it
-has the same payload, and log times that differ by at most `COPY_JITTER_NS`. It counts once, at its
-earliest log time; if one recording has it n times and another m times, it counts max(n, m) times.
-Equal messages of one recording are no copies.
+`COPY_HORIZON_NS`. Some recorders, as those of Humble, write the log time as publish time: between
+one of these and any other it has the same payload, and log times that differ by at most
+`COPY_JITTER_NS`. It counts once, at its earliest log time; if one recording has it n times and
+another m times, it counts max(n, m) times. Equal messages of one recording are no copies.
 
 A latched message is received again by each new recording. It counts at its earliest log time,
 however long ago that is.
@@ -275,9 +275,14 @@ def copies_among(messages: Identities) -> Flags:
     """
     is_copy = _copies_within(messages, COPY_HORIZON_NS)
     is_logged = (messages.publish_times == messages.log_times) | (messages.publish_times == 0)
-    undated = np.flatnonzero(is_logged & ~is_copy)
-    by_payload = messages.rows(undated)._replace(publish_times=np.zeros(undated.size, np.int64))
-    is_copy[undated] = _copies_within(by_payload, COPY_JITTER_NS)
+    is_dated = np.isin(messages.recordings, messages.recordings[~is_logged])
+    if not is_dated.all():
+        # Those with publish times are compared already, and are as of one recording.
+        recordings = np.where(is_dated, -1, messages.recordings)
+        others = np.flatnonzero(~is_copy)
+        rows = messages._replace(recordings=recordings).rows(others)
+        by_payload = rows._replace(publish_times=np.zeros(others.size, np.int64))
+        is_copy[others] = _copies_within(by_payload, COPY_JITTER_NS)
     return is_copy
 
 

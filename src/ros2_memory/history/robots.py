@@ -505,8 +505,10 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
         )
         if not differ and topic != view.pose_topic:
             # By its payload alone a boolean may be any robot's: poses show whose it is.
-            tried = next(view.stream.merged(first, [topic], both), None)
-            by_payload = tried is not None and tried.is_undated
+            streams = (view.stream.merged(extents, [topic], both) for extents in (first, other))
+            by_payload = any(
+                stored.is_undated for stream in streams for stored in islice(stream, 1)
+            )
             differ = by_payload and _differ(view, view.pose_topic, pair, both)
     if reading.is_final:
         if len(remembered) >= MOST_REMEMBERED:

@@ -377,6 +377,42 @@ def test_two_recorders_whose_publish_times_are_their_log_times_make_no_second_ro
         assert figures(memory) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.parametrize("dated", ["a", "b", "bc"])
+def test_a_recorder_that_knows_publish_times_beside_one_that_does_not_makes_no_second_robot(
+    tmp_path: Path, dated: str
+) -> None:
+    draw = Random(dated)
+    flags = [boolean(T0 + n * S // 20, n // 77 % 2 == 1) for n in range(800)]
+    said = [text(T0 + n * S, "at the door") for n in (3, 9, 10, 31)]
+    messages = [mounted("base_link"), *along_x(T0, 40, mps=0.5, hz=10), *flags, *said]
+    for name in sorted({"a", "b", *dated}):
+        received = [
+            replace(message, log_time=at, publish_time=message.log_time if name in dated else at)
+            for message in messages
+            for at in [message.log_time + draw.randrange(100_000, 8_000_000)]
+        ]
+        record(tmp_path, name, in_order(received))
+        if name == "a":
+            expected = figures(memory_of(tmp_path))
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        assert warned(memory) == []
+        assert figures(memory) == pytest.approx(expected, rel=1e-3)
+
+
+def test_equal_messages_of_a_recorder_count_though_one_was_received_as_it_was_published(
+    tmp_path: Path,
+) -> None:
+    flags = [boolean(T0 + n * S // 20, data=False) for n in range(200)]
+    late = [
+        replace(flag, log_time=flag.log_time + 10**6, publish_time=flag.log_time) for flag in flags
+    ]
+    late[150] = flags[150]
+    record(tmp_path, "a", late)
+    record(tmp_path, "b", late[100:])
+    ranged = asked(memory_of(tmp_path), "get_topic_in_range", topic="/bumper", **WINDOW)
+    assert ranged["total"] == 200
+
+
 def test_what_two_robots_say_alike_at_other_moments_counts_for_each(tmp_path: Path) -> None:
     record(tmp_path, "a", [*drive(0.0), text(T0 + 20 * S, "done"), text(T0 + 40 * S, "done")])
     record(tmp_path, "b", [*drive(9.0), text(T0 + 20 * S + S // 2, "done")])
