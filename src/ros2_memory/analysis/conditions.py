@@ -13,7 +13,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias, TypeVar, cast
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Scalar: TypeAlias = bool | int | float | str
+ConditionType: TypeAlias = Literal[
+    "contains", "contains_word", "equals", "above", "below", "near_position"
+]
+"""The keys of `_EXAMPLES`."""
 
 POSITION_KEYS: Final = ("position", "point", "translation")
 """Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""

@@ -27,6 +27,7 @@ from pydantic import (
     WithJsonSchema,
 )
 
+from ros2_memory.analysis.conditions import ConditionType
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
@@ -346,7 +347,7 @@ _Limit: TypeAlias = Annotated[
     BeforeValidator(_as_integer),
 ]
 _ConditionType: TypeAlias = Annotated[
-    Literal["contains", "contains_word", "equals", "above", "below", "near_position"],
+    ConditionType,
     Field(examples=["contains"]),
 ]
 _ConditionValue: TypeAlias = Annotated[

@@ -1,6 +1,7 @@
 import json
 import math
 from itertools import count, product
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import (
     Beyond,
     Condition,
+    ConditionType,
     Contains,
     Equals,
     NearPosition,
@@ -193,7 +195,7 @@ def test_what_a_path_leads_to(value: JsonValue, path: str, found: list[JsonValue
         (
             "near",
             {"x": 1, "y": 2},
-            "'near' is not one of contains, contains_word, equals, above, below, near_position",
+            f"'near' is not one of {', '.join(get_args(ConditionType))};",
         ),
         ("contains", None, "not null"),
         ("contains", ["a", "b"], "not a list"),

@@ -1,11 +1,13 @@
+import json
 import math
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from mcp.types import ListToolsResult
 
+from ros2_memory.analysis.conditions import ConditionType
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.history.view import AtTime
@@ -217,10 +219,7 @@ def test_what_is_no_time_is_told() -> None:
 
 def test_the_condition_type_must_be_a_known_one() -> None:
     reply = refusal("find_last_match", topic="/a", condition_type="like", value="x")
-    assert (
-        'expected one of "contains", "contains_word", "equals", "above", "below", "near_position"'
-        in reply
-    )
+    assert f"expected one of {', '.join(map(json.dumps, get_args(ConditionType)))}" in reply
 
 
 @pytest.mark.parametrize("value", [None, math.nan, {"x": math.inf, "y": 0.0}])
