@@ -66,6 +66,7 @@ from ros2_memory.config_sources import (
 )
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.things.labels import singular
+from ros2_memory.triggers import RuleKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -630,7 +631,7 @@ class KeepRule:
     `after_s` after the rule fired. All moments of the rule together take `max_gb` at most.
     """
 
-    kind: Literal["message", "silent", "recorder_restart"] = "message"
+    kind: RuleKind = "message"
     topic: Text | None = None
     condition_type: Text | None = None
     value: ConditionValue | None = None

@@ -25,7 +25,7 @@ import time
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import source_of
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Channel, Record
+    from ros2_memory.triggers import RuleKind
 
 
 LEAST_NEAR_NS: Final[Ns] = 60 * NS_PER_S
@@ -89,7 +90,7 @@ class Rule:
     """
 
     name: str
-    kind: Literal["message", "silent", "recorder_restart"]
+    kind: RuleKind
     topic: str | None = None
     condition: Condition | None = None
     hold: Ns = 0
