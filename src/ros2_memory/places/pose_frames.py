@@ -417,14 +417,20 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
     """Notes if positions outside of the map are of several runs of odometry."""
     if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
         root = root_above(view, frame_id)
-        advice = f"ask with frame_id={root}"
-        if root != view.limits.map_frame:
-            advice = f"if {root}, which it leads to, is a map, set data.map_frame={root}"
-        leads = f"; {advice}" if root else ""
+        is_map = root is not None and root == view.limits.map_frame
+        leads = f"; ask with frame_id={root}" if is_map else map_to_choose(view, frame_id)
         view.notes.add(
             f"{changing_origin(frame_id)}, and these are several: the same coordinates may be "
             f"another place in each{leads}"
         )
+
+
+def map_to_choose(view: View, frame_id: str) -> str:
+    """Returns how to choose the frame above others as the map, to end a note; empty if none is."""
+    root = root_above(view, frame_id)
+    if root is None or root == view.limits.map_frame:
+        return ""
+    return f"; if {root}, which it leads to, is a map, set data.map_frame={root}"
 
 
 def with_runs(view: View, topic: str, path: PathSlice, trajectory: Trajectory) -> Trajectory:

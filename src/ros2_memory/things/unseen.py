@@ -48,7 +48,7 @@ from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.scan import scan
 from ros2_memory.insights.silences import describe_silences
-from ros2_memory.places.pose_frames import axes_of
+from ros2_memory.places.pose_frames import axes_of, map_to_choose
 from ros2_memory.things.labels import last_word, plain, singular
 from ros2_memory.things.places import MAX_PLACES
 from ros2_memory.things.seen import topics_with_detections
@@ -358,7 +358,7 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
     if len(known.frames) > 2:  # the first is the map's
         yield (
             "without a map, a thing may be listed once for each run of odometry, in coordinates of "
-            "that run"
+            f"that run{map_to_choose(view, known.frames[-1])}"
         )
     if not known.estimate.topics and known.since is None and not question.undecoded:
         yield (

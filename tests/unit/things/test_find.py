@@ -254,6 +254,17 @@ def test_things_of_two_runs_of_odometry_are_not_said_to_be_near_each_other(tmp_p
     assert "may be one thing" not in str(found["notes"])
 
 
+def test_a_map_of_another_name_is_proposed_where_things_are_listed_for_each_run(
+    tmp_path: Path,
+) -> None:
+    for run in range(2):
+        seen = looked(1000 * run, 1000 * run + 60, HERE, ("cup", 3.0, 0.0), in_map=False)
+        begin = (BEGIN + 1000 * run) * S
+        mapped = tf(begin, transform(begin, "map_ned", "odom", (1.0 * run, 0.0, 0.0)))
+        write_splits(tmp_path / str(run), [mapped, *seen])
+    assert "is a map, set data.map_frame=map_ned" in str(ask(tmp_path)["notes"])
+
+
 def test_things_of_two_robots_that_transforms_place_are_said_to_be_mixed(tmp_path: Path) -> None:
     for name, robot in (("wren", HERE), ("robin", (5.0, 0.0, 0.0))):
         seen = looked(0, 60, robot, ("cup", 3.0, 0.0))
