@@ -58,14 +58,16 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
-    if any(most is not None and most < 1 for most in (limit, tail)):
+    most = limit if tail is None else tail
+    if most is not None and most < 1:
         raise InvalidArgumentsError("--limit and --tail must be more than 0")
     memory = bags.memory()
     view = View(memory, Call())
     name = resolve_topic(view, topic)
     window = times.window(memory)
     found = view.stream.messages([name], window, newest_first=tail is not None)
-    messages = islice(found, limit) if tail is None else reversed([*islice(found, tail)])
+    chosen = found if most is None else islice(found, min(most, sys.maxsize))
+    messages = chosen if tail is None else reversed([*chosen])
     rows = extract_values(view, messages, field or (), exact=as_csv or as_json)
     if as_csv:
         lines = _csv_lines(rows)

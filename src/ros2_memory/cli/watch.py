@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from threading import TIMEOUT_MAX
 from typing import Annotated, Final
 
 import numpy as np
@@ -51,8 +52,10 @@ def watch(
     Ages count as in the tools' answers (data.now). Rates are checked only while new data arrives.
     Each update is a table, or a line of JSON with --json. Stop it with Ctrl-C.
     """
-    if not every > 0 or (count is not None and count < 1):
-        raise InvalidArgumentsError("--every and --count must be more than 0")
+    if not 0 < every <= TIMEOUT_MAX:
+        raise InvalidArgumentsError(f"--every must be more than 0 and at most {TIMEOUT_MAX:.0f}")
+    if count is not None and count < 1:
+        raise InvalidArgumentsError("--count must be more than 0")
     memory = replace(bags, words=["reader.include_active=true", *(bags.words or ())]).memory()
     with suppress(KeyboardInterrupt):
         for number in itertools.count(1):
