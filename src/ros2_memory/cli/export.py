@@ -62,6 +62,8 @@ def export(
     """
     if (mcap is None) == (parquet is None):
         raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
+    if mcap is not None and robot is not None:
+        raise InvalidArgumentsError("--robot is for --parquet: MCAP has no column for it")
     memory = bags.memory()
     view = View(memory, Call())
     window = times.window(memory)

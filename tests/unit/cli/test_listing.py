@@ -99,6 +99,7 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("cat '/\x1b[31m' .", "/\\x1b[31m"),
         ("export .", "give one of --mcap FILE and --parquet DIR"),
         ("export . --mcap x --parquet b", "give one of --mcap FILE and --parquet DIR"),
+        ("export . --mcap x --robot r1", "--robot is for --parquet"),
         ("export . --mcap x --last 5 --start 1", "give --last, or --start and --end, not both"),
         ("export . --mcap x --last 0", "--last is 0; it must be more than 0 seconds"),
         ("export . --mcap x --last noon", "--last is noon; it must be more than 0 seconds"),
