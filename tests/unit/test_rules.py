@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -9,6 +10,7 @@ from ros2_memory.bootstrap import exclusions_of, places_of, query_settings_of, r
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle, Storey
+from ros2_memory.triggers import RuleKind
 from ros2_memory.triggers.exclusion import ExclusionRule
 from ros2_memory.triggers.rules import Rule
 from tests.support.memories import ROOT
@@ -27,7 +29,7 @@ def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
     assert rules(tmp_path, shipped) == ()
     commented = shipped[shipped.index("# rules:") :].splitlines()
     ready = rules(tmp_path, "\n".join(line.removeprefix("# ") for line in commented))
-    assert {each.kind for each in ready} == {"message", "recorder_restart", "silent"}
+    assert {each.kind for each in ready} == {*get_args(RuleKind)}
     assert len(ready) == 7
     assert sum(each.max_bytes for each in ready) <= 10**9
 
