@@ -173,7 +173,7 @@ async def test_the_server_answers_to_its_own_names_and_addresses(host: str, name
     assert response.status_code == 200
 
 
-PATHS = ["/", "/health", "/sse", "/mcp", "/messages/"]
+PATHS = ["/", "/health", "/health/recording", "/metrics", "/sse", "/mcp", "/messages/"]
 VISIT = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
 
 
