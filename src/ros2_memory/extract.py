@@ -613,7 +613,8 @@ def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> st
     texts = [name for name in names if looks_like_json(_text(getattr(message, name, None)))]
     in_text = ""
     if texts:
-        key = path.removeprefix(f"{texts[0]}.")
+        head, _, rest = path.partition(".")
+        key = rest if rest and head in {texts[0], *plan.fields} else path
         in_text = (
             f"; {texts[0]} is a text of JSON: a condition, changes, by value and with may be on "
             f"{texts[0]}.{key}"

@@ -123,6 +123,6 @@ def test_a_key_of_a_text_of_json_is_said_to_be_no_field(tmp_path: Path, step: st
     memory = remembered(tmp_path, [text(1_784_000_000 * 10**9, step, "/task")])
     window = {"topic": "/task", "start": 1_784_000_000, "end": 1_784_000_001}
     hint = "data is a text of JSON: a condition, changes, by value and with may be on data.step"
-    for field in ("step", "data.step"):
+    for field in ("step", "data.step", "value.step"):
         reply = asked(memory, "get_topic_in_range", **window, fields=[field])
         assert reply["detail"].endswith(hint) == (step != "heat")
