@@ -14,6 +14,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.history.condition_hints import constant_number
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.held_values import NUMBERS
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
 """Fields that are fractions by the definitions of their messages."""
 _OF_TEXTS: Final = frozenset({"contains", "contains_word"})
+_OF_NUMBERS: Final = frozenset({"above", "below"})
 _FIX_FIELDS: Final = frozenset({"latitude", "longitude", "altitude"})
 
 
@@ -37,7 +39,8 @@ class Sought(NamedTuple):
         topic: name or glob of the topics.
         condition_type: such as "equals".
         value: what is compared.
-        field: dot-path; may be a full path in the messages. Not needed for equal levels.
+        field: dot-path; may be a full path in the messages. Not needed for equal levels, or if
+            each message is a number.
         min_score: least score of detections; None for the configured one.
     """
 
@@ -65,6 +68,9 @@ def condition_of(view: View, sought: Sought) -> Condition:
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
+    elif not field and types and all(map(_is_number, types)):
+        # A message that is one number has no other that could be meant.
+        field = "data" if condition_type in _OF_NUMBERS else None
     field = field and field.strip()
     if field and type_name:
         field = view.extractor.own_path(field, type_name)
@@ -91,6 +97,10 @@ def condition_of(view: View, sought: Sought) -> Condition:
         if number != value
     ]
     return replace(condition, tests_by_type=tuple(named))
+
+
+def _is_number(type_name: str) -> bool:
+    return type_name.startswith(NUMBERS) and not type_name.endswith("Array")
 
 
 def types_matching(view: View, pattern: str) -> frozenset[str]:

@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
+NUMBERS: Final = ("std_msgs/msg/Int", "std_msgs/msg/UInt", "std_msgs/msg/Float")
+"""How the types of messages that are one number, or an array of such, begin."""
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
 _FREQUENT: Final[Key[dict[str, Spans]]] = Key()

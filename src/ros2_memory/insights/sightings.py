@@ -39,6 +39,7 @@ from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
 from ros2_memory.history.held_values import (
+    NUMBERS,
     held_at,
     held_until,
     holds_on,
@@ -77,7 +78,6 @@ if TYPE_CHECKING:
 
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
-_NUMBERS: Final = ("std_msgs/msg/Int", "std_msgs/msg/UInt", "std_msgs/msg/Float")
 _LEFT_TO_SAY_S: Final = 2.0
 """The part of the call's time that a search leaves for reading the messages of matches."""
 
@@ -453,7 +453,7 @@ def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
     for topic in topics:
         what = "text" if is_text(view, topic) else "number"
         types = view.timeline.types_of(topic)
-        is_plain = what == "text" or all(name.startswith(_NUMBERS) for name in types)
+        is_plain = what == "text" or all(name.startswith(NUMBERS) for name in types)
         if is_plain and not is_latched(view, topic):
             yield (
                 f"a {what} on {topic} counts for the moment in which it was said: changes, and by "

@@ -773,7 +773,11 @@ def test_a_rare_number_is_said_to_count_for_its_moment_alone(tmp_path: Path, rec
         row = {"topic": "/row", "condition_type": "equals", "field": "data", "value": 2, **given}
         assert "a number on /row counts for the moment" in str(asked(memory, "find_matches", **row))
         level = {**row, "topic": "/level", "condition_type": "below", "value": 20}
-        assert "counts for the moment" not in str(asked(memory, "find_matches", **level))
+        found = asked(memory, "find_matches", **level)
+        assert "counts for the moment" not in str(found)
+        # A message that is a number needs no field.
+        del level["field"]
+        assert asked(memory, "find_matches", **level) == found
 
 
 @each_way
