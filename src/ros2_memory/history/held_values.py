@@ -34,7 +34,7 @@ from ros2_memory.core.text import listed, repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S, UNDECODED, Note
 from ros2_memory.history.coverage import cut_spans, deleted_by_gap
-from ros2_memory.history.scan import blocks, of_columns, scan
+from ros2_memory.history.scan import blocks, of_columns, open_scan, scan
 from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
 from ros2_memory.messages.to_json import round_integer, round_real
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -55,6 +56,14 @@ _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
 _FREQUENT: Final[Key[dict[str, Spans]]] = Key()
 """Of a timeline: by topic, the `frequent_times` of one that is not latched."""
+_SILENCES: Final[Key[dict[str, Ns]]] = Key()
+"""Of a timeline: by topic, its `silence_of`."""
+_PACED: Final = 20
+"""A topic is regular or not only if it has so many messages."""
+_MOST_PACED: Final = 1000
+"""The newest messages of a topic that say whether it is regular."""
+_REGULAR: Final = 1.05
+"""A topic is regular if one pause in twenty is at most so many times as long as one in four."""
 _MOST_TRIED: Final = 200
 """At most this many messages are read to find one that says something of the field."""
 _MOST_CHARS: Final = 16 << 20
@@ -554,7 +563,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = Fal
 
     On a latched topic, and with `or_rare` on a rare one, it holds until the next message, or as far
     as something is recorded. On another topic it holds until the next message if that comes within
-    `SILENCE_NS`, else it does not hold after `last`.
+    `silence_of`, else it does not hold after `last`.
     """
     if is_latched(view, topic) or (or_rare and holds_on(view, topic, last)):
         ends = [end, view.snapshot.latest or end]
@@ -563,7 +572,8 @@ def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = Fal
         if following is not None:
             ends.append(following.time)
         return max(last, min(ends))
-    following = view.stream.first([topic], TimeWindow(last + 1, last + SILENCE_NS + 1))
+    near = TimeWindow(last + 1, last + silence_of(view, topic) + 1)
+    following = view.stream.first([topic], near)
     return last if following is None else max(last, min(following.time, end))
 
 
@@ -596,6 +606,40 @@ def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
 def holds_on(view: View, topic: str, at: Ns) -> bool:
     """Returns whether what a topic said at a log time holds through silence."""
     return not lies_inside(frequent_times(view, topic), at)
+
+
+def silence_of(view: View, topic: str) -> Ns:
+    """Returns after how long a silence (ns) what a topic said is not known to hold.
+
+    That is `SILENCE_NS`, but one and a half periods of a topic that is regularly published more
+    seldom, as a battery is, or about as often: else each message of it would be a state of its own.
+    """
+    known = view.timeline.memo.of(_SILENCES, dict)
+    if topic not in known:
+        totals = [pace.topic for pace in view.timeline.paces(topic).values()]
+        lengths = sum(of_topic.last - of_topic.first for of_topic in totals)
+        is_slow = 3 * lengths >= SILENCE_NS * sum(of_topic.messages for of_topic in totals)
+        often, seldom = np.quantile(_pauses(view, topic), (0.75, 0.95)) if is_slow else (0, 0)
+        is_regular = seldom <= _REGULAR * often
+        known[topic] = max(SILENCE_NS, int(1.5 * often)) if is_regular else SILENCE_NS
+    return known[topic]
+
+
+def _pauses(view: View, topic: str) -> Ints:
+    """Returns the times (ns) between the newest messages of a topic; 0 if they are too few."""
+    parts: list[IntArray] = []
+    everything = open_scan(view, topic, TimeWindow.everything(), columns=False)
+    for rows in everything.rows(newest_first=True):
+        parts.append(rows.times)
+        if sum(map(len, parts)) > _MOST_PACED:
+            break
+    times = np.sort(np.concatenate(parts))[-_MOST_PACED:] if parts else np.empty(0, np.int64)
+    return np.diff(times) if times.size >= _PACED else np.zeros(1, np.int64)
+
+
+def longest_silence(view: View, topics: Iterable[str]) -> Ns:
+    """Returns the longest `silence_of` some topics."""
+    return max((silence_of(view, topic) for topic in topics), default=SILENCE_NS)
 
 
 def frequent_times(view: View, topic: str) -> Spans:

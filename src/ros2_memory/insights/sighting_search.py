@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.history.held_values import breaks_of, held_until, is_latched
+from ros2_memory.history.held_values import breaks_of, held_until, is_latched, silence_of
 from ros2_memory.history.reverse_search import MET, NOT_MET, Block, ReverseSearch, Tested
 
 if TYPE_CHECKING:
@@ -94,13 +93,17 @@ class _NodeRuns:
         apart: whether each match is a run of its own.
         breaks: of a latched topic: the moments, in order, through which no value holds. On another
             topic (None) none holds through a silence.
+        silence: how long (ns) a pause is a silence.
     """
 
-    def __init__(self, topic: int, node: int, *, apart: bool, breaks: Ints | None) -> None:
+    def __init__(
+        self, topic: int, node: int, *, apart: bool, breaks: Ints | None, silence: Ns
+    ) -> None:
         self._topic = topic
         self._node = node
         self._apart = apart
         self._breaks = breaks
+        self._silence = silence
         self._tables: list[Ints] = []
         # Whether the oldest run may go on in an older message.
         self.is_open = False
@@ -148,7 +151,7 @@ class _NodeRuns:
     def _end_before(self, times: Ints) -> Flags:
         """Returns for each log time whether no run goes on to it from the one before."""
         if self._breaks is None:
-            return np.diff(times, prepend=times[0]) > SILENCE_NS
+            return np.diff(times, prepend=times[0]) > self._silence
         broken = np.searchsorted(self._breaks, times)
         return np.diff(broken, prepend=broken[0]) > 0
 
@@ -164,12 +167,15 @@ class _TopicRuns:
 
     Args:
         topic: its number.
-        apart, breaks: see `_NodeRuns`.
+        apart, breaks, silence: see `_NodeRuns`.
     """
 
-    def __init__(self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None) -> None:
+    def __init__(
+        self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None, silence: Ns
+    ) -> None:
         times = None if breaks is None else np.array(breaks, np.int64)
-        self._new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times)
+        self._new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times, silence=silence)
+        self._silence = silence
         self._by_node: dict[int, _NodeRuns] = {}
         self._waiting: list[Tested] = []
         self._messages = 0
@@ -184,7 +190,7 @@ class _TopicRuns:
     def add(self, block: Block) -> None:
         """Adds the next older block."""
         # What follows this block before a silence ends the runs in it.
-        near = [newer for newer in self._skipped if newer.first - block.last <= SILENCE_NS]
+        near = [newer for newer in self._skipped if newer.first - block.last <= self._silence]
         self._skipped = [*near, block]
         if not block.has_match and not self._is_open():
             return
@@ -249,7 +255,12 @@ def find_runs(
     if latched:
         enough = None
     by_topic = {
-        topic: _TopicRuns(nth, apart=is_log(topic), breaks=breaks.get(topic))
+        topic: _TopicRuns(
+            nth,
+            apart=is_log(topic),
+            breaks=breaks.get(topic),
+            silence=silence_of(view, topic),
+        )
         for nth, topic in enumerate(topics)
     }
     windows = [scope.window] if latched else scope.narrowed()

@@ -2,9 +2,9 @@
 
 A sighting is a run of consecutive messages of one topic that meet a condition. It ends with a
 message that does not, and, unless the topic is latched, where it is silent for longer than
-`SILENCE_NS`: a detector may publish only what it sees. A message that cannot be decoded is neither
-a match nor an end. In a topic of statuses each goal is a sighting, in a log each message. In one of
-diagnostics each node has sightings of its own.
+`silence_of` says: a detector may publish only what it sees. A message that cannot be decoded is
+neither a match nor an end. In a topic of statuses each goal is a sighting, in a log each message.
+In one of diagnostics each node has sightings of its own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from ros2_memory.analysis.conditions import Condition, Equals, NearPosition, matched_texts
 from ros2_memory.analysis.facts import LOG
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
+from ros2_memory.analysis.intervals import FLICKER_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import (
@@ -46,6 +46,7 @@ from ros2_memory.history.held_values import (
     is_latched,
     is_text,
     note_unnamed,
+    silence_of,
 )
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch
@@ -416,7 +417,7 @@ def _matched_before(view: View, search: ReverseSearch, run: Run) -> bool:
     if is_latched(view, run.topic):
         held = held_at(view, run.topic, run.first)
         return held is not None and bool(search.matches(held))
-    near = TimeWindow(max(run.first - SILENCE_NS, MIN_NS), run.first)
+    near = TimeWindow(max(run.first - silence_of(view, run.topic), MIN_NS), run.first)
     for block in search.blocks(run.topic, near):
         tested = block.tested()
         met = tested.met[(tested.nodes == run.node) & (tested.met != UNKNOWN)]
@@ -530,7 +531,7 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
     latched topic, and a flag of a rare one, lasts through silences. No state lasts beyond the
     scope.
     """
-    last = run.last
+    last, silence = run.last, silence_of(view, run.topic)
     if view.timeline.is_log(run.topic):
         return last
     _, end = scope.window.asked()
@@ -540,10 +541,10 @@ def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) 
         until = held_until(view, run.topic, last, end, or_rare=is_flag)
     elif until == MAX_NS:
         # What follows in the window, if anything, is of other nodes of diagnostics.
-        beyond = TimeWindow(max(last + 1, scope.window.stop), last + SILENCE_NS + 1)
+        beyond = TimeWindow(max(last + 1, scope.window.stop), last + silence + 1)
         following = None if beyond.empty else view.stream.first([run.topic], beyond)
         until = last if following is None else following.time
-    is_silent = until - last > SILENCE_NS and not may_hold
+    is_silent = until - last > silence and not may_hold
     return scope.holds_until(last, last if is_silent else max(last, min(until, end)))
 
 

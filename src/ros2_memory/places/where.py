@@ -37,6 +37,7 @@ from ros2_memory.history.held_values import (
     ends_of_holding,
     frequent_times,
     held_times,
+    longest_silence,
 )
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested, met_by_any
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -52,7 +53,7 @@ from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.places.stays import stays_within
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.core.reply import JsonObject
@@ -478,6 +479,7 @@ class _ConditionStates:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
         topics = self.search.topics
+        self._silence = longest_silence(view, topics)
         self._frequent = united(
             chain.from_iterable(frequent_times(view, topic) for topic in topics)
         )
@@ -499,7 +501,7 @@ class _ConditionStates:
 
         What latched and rare topics said holds through silences; what others said does not.
         """
-        topics, around = self.search.topics, window.widened(SILENCE_NS)
+        topics, around = self.search.topics, window.widened(self._silence)
         is_frequent = overlaps_any(self._frequent, around.start, around.stop)
         heard = heard_times(self._view, topics, around) if is_frequent else []
         return united([*held_times(self._view, topics, window), *heard])
@@ -515,7 +517,7 @@ class _ConditionStates:
         if not count or not self._met[count - 1]:
             return False
         last = self._times[count - 1]
-        is_silent = time - last > SILENCE_NS and lies_inside(self._frequent, last)
+        is_silent = time - last > self._silence and lies_inside(self._frequent, last)
         return not is_silent and self._break_after(last) >= time
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
@@ -524,7 +526,7 @@ class _ConditionStates:
             last = self._times[bisect_right(self._times, time) - 1]
             following = self._next_after(time, end)
             known_until = min(following, end)
-            if known_until - last > SILENCE_NS and lies_inside(self._frequent, last):
+            if known_until - last > self._silence and lies_inside(self._frequent, last):
                 return max(time, last)
             break_time = self._break_after(last)
             if break_time < known_until:
@@ -595,22 +597,23 @@ class _ConditionStates:
         return tested.times[rows].tolist(), met_by_any(met, tested.nodes[rows]).tolist()
 
 
-def heard_times(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
-    """Returns when topics had messages, without silences of more than `SILENCE_NS`.
+def heard_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:
+    """Returns when topics had messages, without the silences of `silence_of`.
 
     Only bags that hold a topic for longer are scanned. In others there is no such silence.
     """
     starts, stops = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    silence = longest_silence(view, topics)
     for topic in topics:
         firsts, lasts = view.bounds(topic, window)
-        is_long = lasts - firsts > SILENCE_NS
+        is_long = lasts - firsts > silence
         starts.append(firsts[~is_long])
         stops.append(lasts[~is_long])
         if is_long.any():
             long = spans_of(firsts[is_long], lasts[is_long] + 1)
             for rows in scan(view, topic, window, columns=False, within=united(long)):
-                piece_starts, piece_stops = pieces_of(rows.times, rows.times)
+                piece_starts, piece_stops = pieces_of(rows.times, rows.times, silence)
                 starts.append(piece_starts)
                 stops.append(piece_stops)
-    heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops))
+    heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops), silence)
     return spans_of(heard_from, heard_to + 1)

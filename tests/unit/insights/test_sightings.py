@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import count
+from itertools import accumulate, count
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,53 @@ def test_fields_of_json_in_a_text_are_conditions_like_others(tmp_path: Path, rec
     assert asked(memory, "find_matches", **bumps)["total"] == 2
     rows = asked(memory, "find_matches", **low, by="hour")
     assert dict(zip(rows["columns"][1:], rows["all"], strict=True))["seconds"] == 10.0
+
+
+@each_way
+@pytest.mark.parametrize("period_s", [10, 30])
+def test_a_slow_battery_is_low_once_and_for_as_long_as_its_messages_say(
+    tmp_path: Path, recalls: bool, period_s: int
+) -> None:
+    """It says its charge every 10 s, give or take, and VDA 5050 a state at least every 30 s."""
+    end = 60 * period_s
+    jitter = [0, S // 50, S // 25]
+    told = [
+        message
+        for nth in range(61)
+        for at in [BEGIN + nth * period_s * S + jitter[nth % 3]]
+        for message in (
+            battery(at, 0.5 - nth / 100),
+            text(at, f'{{"order": "{nth // 20}", "batteryCharge": {50 - nth}}}', "/state"),
+        )
+    ]
+    bumps = [boolean(BEGIN + at * S, at % 60 == 59, topic="/bumper") for at in range(end)]
+    memory = remembered(tmp_path, in_order([*told, *bumps]), recalls=recalls)
+    for topic, field, value in (
+        ("/battery_state", "percentage", 0.195),
+        ("/state", "data.batteryCharge", 19.5),
+    ):
+        low = {"topic": topic, "condition_type": "below", "field": field, "value": value}
+        [found] = asked(memory, "find_matches", **low)["sightings"]
+        assert (found["count"], round(found["duration_s"])) == (30, 29 * period_s), topic
+        row = table(asked(memory, "find_matches", **low, by="day"))["all"]
+        assert (row["count"], round(row["seconds"])) == (1, 29 * period_s), topic
+    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    first = {"topic": "/state", "condition_type": "equals", "field": "data.order", "value": "0"}
+    found = asked(memory, "find_matches", **bumped, **{"while": first}, limit=50)
+    assert found["total"] == 20 * period_s // 60
+
+
+@each_way
+def test_events_that_come_at_any_time_stay_sightings_of_their_own(
+    tmp_path: Path, recalls: bool
+) -> None:
+    gaps_s = [6 + 7 * nth * nth % 31 for nth in range(40)]
+    read = [battery(BEGIN + at * S, 0.1) for at in accumulate(gaps_s)]
+    memory = remembered(tmp_path, [*read, odom(BEGIN + 1000 * S)], recalls=recalls)
+    low = {"topic": "/battery_state", "condition_type": "below", "field": "percentage"}
+    apart = [gap for gap in gaps_s[1:] if gap > 10]
+    found = asked(memory, "find_matches", **low, value=0.2, limit=50)
+    assert found["total"] == 1 + len(apart)
 
 
 @each_way
