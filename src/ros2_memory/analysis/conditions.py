@@ -13,7 +13,7 @@ import struct
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, TypeAlias, TypeVar, cast
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate, caseless, looks_like_json
@@ -213,6 +213,7 @@ class Beyond:
     What a float32 field stores in place of the limit is excluded, too: 0.2000000030 for 0.2.
     """
 
+    folded: ClassVar[None] = None
     limit: int | float
     above: bool
 
@@ -238,6 +239,7 @@ class NearPosition:
     is not tested here. A position without a finite x and y (and z, if one is asked) never matches.
     """
 
+    folded: ClassVar[None] = None
     x: float
     y: float
     z: float | None
@@ -491,7 +493,10 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
         return Equals(value)
     test = Contains(value, whole=condition_type == "contains_word")
     if isinstance(value, str) and not (test.folded or "").strip():
-        raise InvalidArgumentsError(f"'{condition_type}' takes a text that is not blank; {example}")
+        raise InvalidArgumentsError(
+            f"'{condition_type}' takes a text that is not blank; {example}; for any text,"
+            " get_topic_in_range with changes lists each that a topic, or one of its fields, held"
+        )
     return test
 
 

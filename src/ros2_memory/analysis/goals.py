@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.conditions import Contains, Equals
+from ros2_memory.analysis.conditions import Equals
 from ros2_memory.core.errors import InvalidArgumentsError
 
 if TYPE_CHECKING:
@@ -57,8 +57,7 @@ def while_active(topic: str, condition: Condition) -> Condition:
     Raises:
         InvalidArgumentsError: the word is no status, or none of a goal that is active.
     """
-    test = condition.test
-    if condition.field or not isinstance(test, Contains | Equals) or test.folded is None:
+    if condition.field or condition.test.folded is None:
         return condition
     statuses = statuses_matching(topic, condition)
     if len(statuses) > 1 or statuses & ENDED:

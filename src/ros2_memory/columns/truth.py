@@ -309,7 +309,7 @@ class _LeafTest(NamedTuple):
     def is_needed(self) -> bool:
         """Whether any value of the leaf's kind can pass."""
         if self.leaf.kind is Kind.TEXT:
-            return self._folded is not None
+            return self.test.folded is not None
         if self.leaf.kind is Kind.BOOLEAN:
             return self.passes(value=True) or self.passes(value=False)
         return isinstance(self.test, Beyond) or bool(self.numbers)
@@ -326,7 +326,7 @@ class _LeafTest(NamedTuple):
         if zones is None:
             return True
         if self.leaf.kind is Kind.TEXT:
-            may_have = zones.may_have(self._folded or "")
+            may_have = zones.may_have(self.test.folded or "")
             return may_have | zones.may_be_json if self.leaf.json_depth else may_have
         if self.leaf.kind is not Kind.BOOLEAN and isinstance(self.test, Beyond):
             return zones.reaches(self.test.limit, above=self.test.above)
@@ -356,12 +356,8 @@ class _LeafTest(NamedTuple):
         if is_of_array and around is not None:
             yield from self._in_long_arrays(values, around, has_short=has_column)
 
-    @property
-    def _folded(self) -> str | None:
-        return None if isinstance(self.test, Beyond) else self.test.folded
-
     def _passing_texts(self, values: Values) -> TruthValues:
-        may_pass = values.letters(self.leaf, self._folded or "")
+        may_pass = values.letters(self.leaf, self.test.folded or "")
         if may_pass is None:
             return TruthValues.known(values.texts(self.leaf).are(self._passes_text))
         is_one_word = isinstance(self.test, Contains) and self.test.is_one_word

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 _FRACTIONS: Final = frozenset({"percentage", "relative_humidity"})
 """Fields that are fractions by the definitions of their messages."""
-_OF_TEXTS: Final = frozenset({"contains", "contains_word"})
 _OF_NUMBERS: Final = frozenset({"above", "below"})
 _FIX_FIELDS: Final = frozenset({"latitude", "longitude", "altitude"})
 
@@ -84,11 +83,6 @@ def condition_of(view: View, sought: Sought) -> Condition:
         )
     except InvalidArgumentsError as error:
         hint = unknown_name_hint(value, field, types)
-        if isinstance(value, str) and not value.strip() and condition_type in _OF_TEXTS:
-            hint = (
-                "; for any text, get_topic_in_range with changes lists each that a topic, or one "
-                "of its fields, held"
-            )
         raise InvalidArgumentsError(f"{error}{hint}") from error
     _require_fraction(view, pattern, condition)
     named = [

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Condition, Contains, Equals, at_field, plain_text
+from ros2_memory.analysis.conditions import Condition, Equals, at_field, plain_text
 from ros2_memory.analysis.refusals import refusal_for, shows_field, summary_conditions
 from ros2_memory.columns.stated import Nodes
 from ros2_memory.columns.stored import StoredTable
@@ -408,7 +408,7 @@ class ReverseSearch:
     def _refusal_of_type(self, topic: str, before: Ns, type_name: str) -> str | None:
         """Returns why no message of a type can match, by the newest message with its fields."""
         condition = self.condition.of_type(type_name, self._view.extractor)
-        field, test = condition.field or "", condition.test
+        field = condition.field or ""
         messages = self._view.stream.messages(
             [topic], TimeWindow(MIN_NS, before), newest_first=True
         )
@@ -433,7 +433,7 @@ class ReverseSearch:
                 f"{field!r} is in the messages of {type_name}, but not among the fields that are "
                 "searched; get_topic_in_range shows it with fields, and its extremes"
             )
-        word = test.folded if isinstance(test, Contains | Equals) else None
+        word = condition.test.folded
         if refusal is None or word is None:
             return refusal
         return refusal + hint_on_constants(newest.record.channel.schema, field, word)

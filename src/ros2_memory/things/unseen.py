@@ -287,8 +287,7 @@ def _named_numbers(view: View, topics: Sequence[str], condition: Condition) -> t
 
     Then a number stands for the word.
     """
-    test = condition.test
-    word = test.folded if isinstance(test, Contains | Equals) else None
+    word = condition.test.folded
     if condition.field or not word:
         return ()
     # The statuses of goals are searched by their words.
