@@ -80,7 +80,7 @@ function query() {
   if (state.last === null) {
     given.set("start", state.span.start.toFixed(3));
     given.set("end", state.span.end.toFixed(3));
-  } else given.set("last", state.last === "all" ? 1e10 : state.last);
+  } else given.set("last", state.last === "all" ? 9e9 : state.last);
   for (const each of plots.names) given.append("signal", each);
   for (const [name, value] of Object.entries(chosenPart())) given.set(name, value);
   given.set("named", "1");
