@@ -3,9 +3,10 @@
 Recordings overlap for some seconds while one takes over from the other. A message that is in both
 has the same publish time and payload in each, and log times that differ by at most
 `COPY_HORIZON_NS`. Some recorders, as those of Humble, write the log time as publish time: between
-one of these and any other it has the same payload, and log times that differ by at most
-`COPY_JITTER_NS`. It counts once, at its earliest log time; if one recording has it n times and
-another m times, it counts max(n, m) times. Equal messages of one recording are no copies.
+one of these and any other it has the same payload, which neither has again soon, and log times that
+differ by at most `COPY_JITTER_NS`. It counts once, at its earliest log time; if one recording has
+it n times and another m times, it counts max(n, m) times. Equal messages of one recording are no
+copies.
 
 A latched message is received again by each new recording. It counts at its earliest log time,
 however long ago that is.
@@ -282,8 +283,20 @@ def copies_among(messages: Identities) -> Flags:
         others = np.flatnonzero(~is_copy)
         rows = messages._replace(recordings=recordings).rows(others)
         by_payload = rows._replace(publish_times=np.zeros(others.size, np.int64))
-        is_copy[others] = _copies_within(by_payload, COPY_JITTER_NS)
+        once = _said_once(by_payload)
+        is_copy[others[once]] = _copies_within(by_payload.rows(once), COPY_JITTER_NS)
     return is_copy
+
+
+def _said_once(messages: Identities) -> IntArray:
+    """Returns the rows whose payload their recording has not again within `COPY_HORIZON_NS`.
+
+    A boolean that is published ten times a second may be any robot's.
+    """
+    order = np.lexsort((messages.log_times, messages.hashes, messages.recordings))
+    apart, _, of_hashes, of_recordings = (np.diff(column[order]) for column in messages)
+    is_again = (of_hashes == 0) & (of_recordings == 0) & (apart <= COPY_HORIZON_NS)
+    return np.sort(order[~(np.append(is_again, False) | np.append(False, is_again))])
 
 
 def _copies_within(messages: Identities, horizon: Ns) -> Flags:

@@ -161,10 +161,11 @@ class MergedStream:
     def _count_copies(self, topic: str, part: TimeWindow) -> Counter[_MessageKey]:
         """Returns how many messages with each key are copies, in a part of a topic.
 
-        What was received shortly before decides, and for that what was received before it: as much
-        is compared as by `Scan`.
+        What was received shortly before decides, and for that what was received before it, and
+        whether it is said again: as much is compared as by `Scan`.
         """
-        around = TimeWindow(max(part.start - 2 * COPY_HORIZON_NS, MIN_NS), part.stop)
+        since = max(part.start - 2 * COPY_HORIZON_NS, MIN_NS)
+        around = TimeWindow(since, min(part.stop + COPY_HORIZON_NS, MAX_NS))
         extents = self.overlapping_bags([topic], around)
         recordings = sorted({str(extent.bag.recording) for extent in extents})
         number_of = {recording: number for number, recording in enumerate(recordings)}

@@ -503,13 +503,11 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
             _lacks_most(view, topic, here, there, both)
             for here, there in ((first, other), (other, first))
         )
-        if not differ and topic != view.pose_topic:
+        if topic != view.pose_topic and _recordings_with(view, view.pose_topic).keys() >= {*pair}:
             # By its payload alone a boolean may be any robot's: poses show whose it is.
             streams = (view.stream.merged(extents, [topic], both) for extents in (first, other))
-            by_payload = any(
-                stored.is_undated for stream in streams for stored in islice(stream, 1)
-            )
-            differ = by_payload and _differ(view, view.pose_topic, pair, both)
+            if any(stored.is_undated for stream in streams for stored in islice(stream, 1)):
+                differ = _differ(view, view.pose_topic, pair, both)
     if reading.is_final:
         if len(remembered) >= MOST_REMEMBERED:
             remembered.clear()
