@@ -705,8 +705,9 @@ def _similar_labels(known: KnownThings, key: str, label: str) -> Iterator[str]:
     similar = [name for name in names if key in name or name in key]
     similar += difflib.get_close_matches(key, names, 3)
     shown = [*dict.fromkeys(similar)] or names
-    meant = f"; did you mean {similar[0]}?" if similar else ""
+    meant = f"did you mean {similar[0]}?" if similar else "find_matches searches identifiers, too"
     yield repeating(
-        f"no detector reported {abbreviate(label)}{known.reach}; there are: {listed(shown)}{meant}",
+        f"no detector reported the label {abbreviate(label)}{known.reach}; "
+        f"there are: {listed(shown)}; {meant}",
         shown,
     )
