@@ -131,8 +131,8 @@ def _bags_by_folder(
 
 
 def _is_left_alone(name: str) -> bool:
-    """Whether a path below the bag directory is hidden, or `lost+found`."""
-    return "/." in f"/{name}" or name == LOST_AND_FOUND
+    """Whether a path below the bag directory is hidden, or in `lost+found`."""
+    return "/." in f"/{name}" or f"{name}/".startswith(f"{LOST_AND_FOUND}/")
 
 
 def _remove_emptied(root: Path, folder: Path, *, had_bags: bool) -> None:

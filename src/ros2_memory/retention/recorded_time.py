@@ -114,7 +114,7 @@ class RecordedTime:
                 for name in recordings
             }
 
-    def doubtful(self, recordings: Iterable[str]) -> frozenset[str]:
+    def doubtful(self, recordings: Collection[str]) -> frozenset[str]:
         """Returns the recordings whose dates are not known to be right."""
         with self._lock:
             self._load()

@@ -72,7 +72,7 @@ def test_a_directory_that_cannot_be_listed_is_named(
 def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:
     make(tmp_path, "rec_1/rec_1_0.mcap", "rec_1/notes.txt", "map.pgm", "metadata.yaml")
     make(tmp_path, "not_a_bag/metadata.yaml", "not_a_bag/handover.json", "x/recorder.json")
-    make(tmp_path, ".cache/a.mcap", "recorder.lock")
+    make(tmp_path, ".cache/a.mcap", "lost+found/#12/a.mcap", "recorder.lock")
     before = left(tmp_path)
     clear_bags(tmp_path)
     assert [*set(before) - set(left(tmp_path))] == ["rec_1/rec_1_0.mcap"]
