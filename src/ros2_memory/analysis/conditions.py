@@ -59,8 +59,6 @@ _EXAMPLES: Final = {
     "below": 'condition_type "below", value 0.2, field "percentage"',
     "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
 }
-_SHOWN: Final = 5e-12
-"""Half of the eleventh digit, the last that replies show."""
 _SINGLE_BELOW: Final = 2**24
 """A float32 represents every whole number below this."""
 _EXACT_BELOW: Final = 2**53
@@ -147,11 +145,10 @@ def _has_words(text: str, words: str) -> bool:
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    1 and 0 equal true and false. A number equals itself, the float that a float32 field stores in
-    its place, and floats that replies show as it (`equal_within`): 0.3 is also 0.1 + 0.2. Strings
-    are compared without regard to case. A string that spells a boolean or a number equals that,
-    too, since planners put values in quotes. In a string that is JSON, the labels of its detections
-    are compared, too.
+    1 and 0 equal true and false. A number equals itself, and the float that a float32 field stores
+    in its place. Strings are compared without regard to case. A string that spells a boolean or a
+    number equals that, too, since planners put values in quotes. In a string that is JSON, the
+    labels of its detections are compared, too.
     """
 
     value: Scalar
@@ -185,13 +182,8 @@ class Equals:
         if isinstance(leaf, NamedNumber) and self.passes(leaf.name):
             return True
         if isinstance(leaf, int | float):
-            if not isinstance(leaf, float):
-                return any(leaf == number for number in self.integers)
-            return any(
-                leaf == number or (within > 0 and abs(leaf - number) <= within)
-                for number in self.numbers
-                for within in [equal_within(number)]
-            )
+            numbers = self.numbers if isinstance(leaf, float) else self.integers
+            return any(leaf == number for number in numbers)
         if not isinstance(leaf, str) or self.folded is None:
             return False
         folded = caseless(leaf)
@@ -619,11 +611,6 @@ def stored_as(number: float) -> float:
     """
     rounded = _float32(number)
     return number if rounded == 0.0 or _SINGLE_BELOW <= abs(number) < _EXACT_BELOW else rounded
-
-
-def equal_within(number: float) -> float:
-    """Returns how far a float may be from a number that is shown in its place."""
-    return _SHOWN * abs(number) if abs(number) < _SINGLE_BELOW else 0.0
 
 
 def _float32(number: float) -> float:

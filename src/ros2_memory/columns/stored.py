@@ -323,10 +323,10 @@ class Zones(NamedTuple):
         """Returns the zones of the values divided by a positive number."""
         return self._replace(low=self.low / by, high=self.high / by)
 
-    def spans(self, number: float, within: float = 0.0) -> Flags:
-        """Returns which parts may have a value this close to a number."""
+    def spans(self, number: float) -> Flags:
+        """Returns which parts may have a number as a value."""
         at = as_float(number)
-        return (self.low <= at + within) & (at - within <= self.high)
+        return (self.low <= at) & (at <= self.high)
 
     def reaches(self, limit: float, *, above: bool) -> Flags:
         """Returns which parts may have a value above a limit, or else below it."""

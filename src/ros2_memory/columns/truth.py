@@ -21,7 +21,6 @@ from ros2_memory.analysis.conditions import (
     Contains,
     Equals,
     NearPosition,
-    equal_within,
     points,
 )
 from ros2_memory.columns.detections import may_be_json, without_low
@@ -335,7 +334,7 @@ class _LeafTest(NamedTuple):
             numbers = [value for value in (False, True) if self.passes(value=value)]
         possible: bool | Mask = False
         for number in numbers:
-            possible = possible | zones.spans(number, equal_within(number))
+            possible = possible | zones.spans(number)
         return possible
 
     def passing(self, values: Values) -> Iterator[_Passing]:
@@ -390,8 +389,7 @@ class _LeafTest(NamedTuple):
         is_near: Mask = np.isinf(errors)
         for bound in self._bounds:
             with np.errstate(invalid="ignore"):  # infinity less infinity
-                within = errors + equal_within(bound)
-                is_near |= (np.abs(column - as_float(bound)) <= within) & (errors > 0.0)
+                is_near |= (np.abs(column - as_float(bound)) <= errors) & (errors > 0.0)
         if exactly is None:
             return TruthValues(passed & ~is_near, passed | is_near)
         unsettled = np.flatnonzero(is_near)
@@ -407,7 +405,7 @@ class _LeafTest(NamedTuple):
 
     def _passing_exactly(self, column: Numeric) -> Mask:
         if not isinstance(self.test, Beyond):
-            return _passing_as_any(column, self.numbers)
+            return equal_to_any(column, self.numbers)
         passed = beyond(column, self.test.limit, above=self.test.above)
         if self.leaf.kind is Kind.REAL:
             passed &= ~equal_to_any(column, (self.test.stored,))
@@ -455,12 +453,11 @@ class _LeafTest(NamedTuple):
         else:
             surely, perhaps = nowhere(len(least))
             for number in self.numbers:
-                at, within = as_float(number), error + equal_within(number)
+                at = as_float(number)
                 if error == 0.0:
-                    surely |= _passing_as_any(least, (number,))
-                    surely |= _passing_as_any(greatest, (number,))
+                    surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
                 # Infinities are not among the finite numbers.
-                perhaps |= math.isinf(at) | ((least - within <= at) & (at <= greatest + within))
+                perhaps |= math.isinf(at) | ((least - error <= at) & (at <= greatest + error))
         perhaps |= np.isnan(least)
         if self.leaf.kind is not Kind.REAL:
             # Integers of more than 53 bits were rounded to floats.
@@ -509,16 +506,6 @@ def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
         elif nearest == number:
             is_equal |= column == np.float64(nearest)
     return is_equal
-
-
-def _passing_as_any(column: Numeric, numbers: Sequence[float]) -> Mask:
-    """Returns which numbers equal one of these, compared as `Equals` does."""
-    passing = equal_to_any(column, numbers)
-    for number in numbers if column.dtype.kind == "f" else ():
-        with np.errstate(invalid="ignore"):  # infinity less infinity
-            apart = np.abs(column - np.float64(as_float(number)))
-        passing |= apart <= equal_within(number)
-    return passing
 
 
 class _PlaceTest(NamedTuple):

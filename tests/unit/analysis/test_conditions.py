@@ -77,10 +77,6 @@ def test_what_contains_finds(
         *((math.nan, [leaf], False) for leaf in (math.nan, None, 0)),
         *((number, [number], True) for number in (0.9, 1e300, -1e300, 10**400, 1e-320, math.inf)),
         (2**53 + 1, 2**53 + 2, False),
-        # As it is shown, and no other.
-        *((0.3, {"data": shown}, True) for shown in (0.1 + 0.2, 0.30000000000001)),
-        *((0.3, {"data": other}, False) for other in (0.3000000001, 0.2999999999)),
-        (100_000_000.5, 100_000_000.5000001, False),
         # What a float32 would hold of it is another number.
         *((1_795_000_001, {"order": other}, False) for other in (1_795_000_064, 1_795_000_064.0)),
         *(("docked", {"state": held}, True) for held in ("docked", "Docked", "DOCKED")),

@@ -271,22 +271,6 @@ def test_what_was_used_in_an_hour_is_its_first_number_less_its_last(
 
 
 @each_way
-@pytest.mark.parametrize("kind", ["Float32", "Float64"])
-def test_a_number_is_found_as_replies_show_it(tmp_path: Path, kind: str, *, recalls: bool) -> None:
-    sums = [nth * 0.1 for nth in range(30)]
-    write_numbers(tmp_path, *((kind, number) for number in sums))
-    memory = memory_of(tmp_path, recalls=recalls)
-    given = {"topic": "/number", "start": T0, "end": T0 + 29, "fields": ["value"]}
-    shown = [number for _, number in asked(memory, "get_topic_in_range", **given)["rows"]]
-    assert shown == [round(number, 1) for number in sums]
-    for nth, number in enumerate(shown):
-        sought = {"topic": "/number", "condition_type": "equals", "value": number}
-        found = asked(memory, "find_matches", **sought)
-        assert [row["first_seen"] for row in found["sightings"]] == [T0 + nth]
-        assert asked(memory, "find_matches", **sought, by="day")["all"][2] == 1
-
-
-@each_way
 def test_numbers_in_an_object_have_extremes_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
     driven = [odom(BEGIN + n * S, x=float(n), y=-2.0 * n, yaw=0.1 * n) for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
