@@ -38,7 +38,7 @@ Scalar: TypeAlias = bool | int | float | str
 ConditionType: TypeAlias = Literal[
     "contains", "contains_word", "equals", "above", "below", "near_position"
 ]
-"""The keys of `_EXAMPLES`."""
+"""Each has an example in `_EXAMPLES`."""
 
 POSITION_KEYS: Final = ("position", "point", "translation")
 """Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""

@@ -129,9 +129,9 @@ def state_of(value: JsonValue, type_name: str) -> State:
 
 
 def source_of(value: JsonValue, type_name: str) -> str:
-    """Returns whose an extracted message is, of several that share a topic; empty for others.
+    """Returns which of several sources of a topic an extracted message is from; empty if unknown.
 
-    Of diagnostics it is the node, by the first status, of a battery its location.
+    For diagnostics that is the node, by the first status; for a battery, its location.
     """
     names: list[JsonValue] = []
     if type_name == DIAGNOSTICS:

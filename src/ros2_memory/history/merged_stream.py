@@ -161,8 +161,8 @@ class MergedStream:
     def _count_copies(self, topic: str, part: TimeWindow) -> Counter[_MessageKey]:
         """Returns how many messages with each key are copies, in a part of a topic.
 
-        What was received shortly before decides, and for that what was received before it, and
-        whether it is said again: as much is compared as by `Scan`.
+        Messages of `COPY_HORIZON_NS` before decide, for these the ones before them, and the next
+        ones with the same payload: `Scan` compares as much.
         """
         since = max(part.start - 2 * COPY_HORIZON_NS, MIN_NS)
         around = TimeWindow(since, min(part.stop + COPY_HORIZON_NS, MAX_NS))

@@ -86,7 +86,7 @@ def visits(
 
     The place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map
     (the default) or the frame of the poses. `span` bounds the search. With `during` visits count
-    as `ConfirmedStays` says, and nothing is said about now.
+    as in `ConfirmedStays`, and none has `there_now`.
 
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the place is invalid, the frame

@@ -262,14 +262,14 @@ class DrivenInside(AnswerWithNotes):
         frame_id: of the waypoints.
         where: the name of the region, or its bounds; None if no region was asked about.
         visits: how often the robot was inside while the conditions held; None without a region.
-        duration: for how long that was in all.
-        start: log time at which that first began; None if it never did.
-        end: log time at which that last ended; None if it never was.
-        distance_m: metres driven then.
-        avg_speed: distance by duration (m/s); None if that is of one pose alone.
+        duration: how long (ns) all counted time lasts.
+        start: log time (ns) at which counted time begins; None without any.
+        end: log time (ns) at which counted time ends; None without any.
+        distance_m: metres driven in it.
+        avg_speed: distance by duration (m/s); None if one pose alone counts.
         max_speed: over a second (m/s); None as for `avg_speed`.
-        waypoints: of the path then; `jump` marks where a stretch of it begins.
-        farthest: the pose then that is farthest from a point; None if no point was asked about.
+        waypoints: of the counted path; `jump` marks where a stretch of it begins.
+        farthest: the counted pose that is farthest from a point; None if no point was asked about.
         unknown: for how long it is not known, though something was recorded, whether the conditions
             held.
     """
