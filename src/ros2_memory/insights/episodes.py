@@ -206,11 +206,14 @@ class MeanwhileReader:
     def __init__(self, view: View, topic: str) -> None:
         self._view = view
         # No name of a ROS 2 topic has a dot; one of another program may.
-        name, _, field = (
-            (topic, "", "") if topic in view.timeline.topics() else topic.partition(".")
-        )
-        self._topic = resolve_topic(view, name)
-        self._values = HeldValues(view, self._topic, field or None, asked="with")
+        recorded = {name.removeprefix("/") for name in view.timeline.topics()}
+        parts = topic.split(".")
+        lengths = range(len(parts), 0, -1)
+        named = (n for n in lengths if ".".join(parts[:n]).removeprefix("/") in recorded)
+        length = next(named, 1)
+        self._topic = resolve_topic(view, ".".join(parts[:length]))
+        field = ".".join(parts[length:]) or None
+        self._values = HeldValues(view, self._topic, field, asked="with")
         self._is_over = False
 
     def during(self, first: Ns, until: Ns) -> tuple[Spell, ...] | None:

@@ -355,7 +355,7 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
     """Holds the lock of a lake; the file of the lock names this process.
 
     Raises:
-        LakeError: another process holds the lock; or the file system has no locks.
+        LakeError: another process holds the lock; or the folder cannot be written, or has no locks.
     """
     path, flags = state_dir / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     with ExitStack() as opened:
@@ -371,7 +371,7 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
             do = "a lake has one writer: stop that process first"
             raise LakeError(f"{holder} writes into this lake; {do}") from None
         except OSError as error:
-            do = "lake.state_dir must be on a file system that supports locks"
+            do = "lake.state_dir must be a folder of this user, on a file system that has locks"
             raise LakeError(f"{path} cannot be opened or locked: {error.strerror}; {do}") from error
         yield
 

@@ -396,7 +396,7 @@ class Eraser:
             if (also, elsewhere) == (handover.also_counts, handover.counts_elsewhere):
                 return
             written = read_heartbeat(self.bag_dir).recordings
-            if self.own is None or self.own.name_of(folder) in written:
+            if self._relative(folder) in written:
                 raise BagError(str(target), "its recorder still writes it; forget again later")
             write_handover(folder, replace(handover, also_counts=also, counts_elsewhere=elsewhere))
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))

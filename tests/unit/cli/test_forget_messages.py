@@ -203,7 +203,8 @@ def test_a_hard_link_elsewhere_is_named_and_holds_nothing_up(
     assert ERASING.read(bag_dir) is None
 
 
-def test_sidecars_follow(bag_dir: Path, forget: Forget) -> None:
+@pytest.mark.parametrize("foreign", ["keep", "delete"])
+def test_sidecars_follow(bag_dir: Path, forget: Forget, foreign: str) -> None:
     going, staying = messages(1)[2], messages(1)[0]
     assert going.topic == CAMERA
     ids = {each.topic: [message_id(each.published, each.payload)] for each in (going, staying)}
@@ -212,7 +213,7 @@ def test_sidecars_follow(bag_dir: Path, forget: Forget) -> None:
     sidecar.write_text(json.dumps({"format": 1, "state": "counts", "counts_elsewhere": listed}))
     left(sidecar)
     written = sidecar.stat().st_mtime_ns
-    forget(0, 9.5, 15, OF_CAMERA)
+    forget(0, 9.5, 15, f"{OF_CAMERA} retention.foreign={foreign}")
     told = json.loads(sidecar.read_text())["counts_elsewhere"]
     assert told == {
         "rec_a_1.mcap": {staying.topic: ids[staying.topic]},

@@ -979,3 +979,13 @@ def test_with_takes_a_field_of_a_topic_whose_messages_have_several(
     assert "name one of its fields, as /battery_state.FIELD" in refused["detail"]
     unknown = asked(memory, "find_matches", **{"with": "/battery_state.mood", **bumped})
     assert "mood" in unknown["detail"]
+
+
+@pytest.mark.parametrize("name", ["/plc.state", "plc.state", "/plc.state.data"])
+def test_a_topic_with_a_dot_in_its_name_is_read_beside_another(tmp_path: Path, name: str) -> None:
+    said = [text(BEGIN + n * S, "drive" if n < 8 else "dock", "/plc.state") for n in range(20)]
+    met = [boolean(BEGIN + n * S + 1, 5 <= n < 7) for n in range(20)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", in_order([*said, *met]))
+    asked_for = {"topic": "/bumper", "condition_type": "equals", "value": True, "with": name}
+    (row,) = asked(memory_of(tmp_path), "find_matches", **asked_for)["sightings"]
+    assert "drive" in str(row["with"])
