@@ -14,7 +14,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -55,10 +55,11 @@ from ros2_memory.messages.conversions import (
     xyz,
     xyzw,
 )
+from ros2_memory.messages.detections import parsed_json
 from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, ReplyJson
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from ros2_memory.core.timebase import Ns
 
@@ -74,6 +75,18 @@ _LISTED_NAMES: Final = 40
 _TURNS: Final = ("orientation", "rotation")
 """Fields in which a quaternion is shown as angles."""
 _AS_JSON: Final = json.JSONEncoder(separators=(",", ":")).encode
+
+
+class TextAbove(NamedTuple):
+    """A text into which a dot-path leads, and the rest of the path."""
+
+    text: str
+    below: list[str]
+
+    @property
+    def is_json(self) -> bool:
+        """Whether it may be JSON."""
+        return looks_like_json(self.text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,19 +307,21 @@ class SchemaExtractor:
             message: the decoded message.
             type_name: its type.
             fields: dot-paths that narrow the value; it is then an object keyed by them. A path
-                means the extracted value's own field, or else the full path in the message.
+                means the extracted value's own field, or else the full path in the message, and
+                may go on into a text of JSON: null, with a note, if this text lacks the key.
 
         Raises:
             InvalidArgumentsError: there is no such field; the sentence lists those there are.
         """
         nodes = {path: self._find(message, type_name, path) for path in fields}
-        for path, node in nodes.items():
-            if node is ABSENT:
-                plan = self.plan(type_name)
-                raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
+        absent = [path for path, node in nodes.items() if node is ABSENT]
+        for path in absent:
+            if not self.text_above(message, type_name, path).is_json:
+                self.require(message, type_name, path)
         limit, squeeze = self.limit, 1
         while True:
             rendering = ReplyJson(limit, squeeze)
+            _note_absent(rendering, absent)
             value: JsonValue = (
                 {path: rendering.value(node, path) for path, node in nodes.items()}
                 if nodes
@@ -316,6 +331,25 @@ class SchemaExtractor:
             if len(text) <= self._max_chars or (limit == 1 and squeeze >= MAX_SQUEEZE):
                 return Extracted(value, rendering.notes, text)
             limit, squeeze = max(limit // 2, 1), squeeze * 2
+
+    def require(self, message: object, type_name: str, path: str) -> None:
+        """Checks that a message, or a text of JSON in it, has a field.
+
+        Raises:
+            InvalidArgumentsError: it has not; the sentence lists the fields that there are.
+        """
+        if self._find(message, type_name, path) is ABSENT:
+            plan = self.plan(type_name)
+            raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
+
+    def text_above(self, message: object, type_name: str, path: str) -> TextAbove:
+        """Returns the text, such as one of JSON, into which a path leads; "" without one."""
+        segments = path.split(".")
+        for nth in range(1, len(segments)):
+            text = self._member(message, type_name, ".".join(segments[:nth]))
+            if isinstance(text, str):
+                return TextAbove(text, segments[nth:])
+        return TextAbove("", [])
 
     def pose(self, message: object, type_name: str) -> Pose | None:
         """Returns the pose of a message (m), in its header's frame; None if it has none.
@@ -440,13 +474,20 @@ class SchemaExtractor:
             for name, path in self.plan(type_name).fields.items()
         }
         absent = [name for name, node in nodes.items() if node is ABSENT]
-        for name in absent:
-            rendering.note("absent", name, f"{name}: this message has no such field")
+        _note_absent(rendering, absent)
         if len(absent) == len(nodes):
             return rendering.value(message, "")
         return {name: rendering.value(node, name) for name, node in nodes.items()}
 
     def _find(self, message: object, type_name: str, path: str) -> object:
+        """Returns what is at a path in a message or in a text of JSON there, or `ABSENT`."""
+        node = self._member(message, type_name, path)
+        if node is ABSENT:
+            text = self.text_above(message, type_name, path)
+            return descend(parsed_json(text.text), text.below) if text.is_json else ABSENT
+        return node
+
+    def _member(self, message: object, type_name: str, path: str) -> object:
         """Returns what is at a path in a message, or `ABSENT`.
 
         The path begins with a name of the schema map, or with a field of a type that is not mapped;
@@ -602,6 +643,11 @@ def _plain(node: object) -> object:
     return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
 
 
+def _note_absent(rendering: ExactJson, paths: Iterable[str]) -> None:
+    for path in paths:
+        rendering.note("absent", path, f"{path}: this message has no such field")
+
+
 def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> str:
     names = names_of(message)
     fields = listed(names, at_most=_LISTED_NAMES)
@@ -610,15 +656,12 @@ def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> st
         return f"{type_name} has no field {path!r}; {what_it_has}"
     angles = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
     meant = f" (did you mean {angles[0]}?)" if angles else ""
-    texts = [name for name in names if looks_like_json(_text(getattr(message, name, None)))]
     in_text = ""
-    if texts:
-        head, _, rest = path.partition(".")
-        key = rest if rest and head in {texts[0], *plan.fields} else path
-        in_text = (
-            f"; {texts[0]} is a text of JSON: a condition, changes, by value and with may be on "
-            f"{texts[0]}.{key}"
-        )
+    for name in names:
+        text = _text(getattr(message, name, None))
+        if looks_like_json(text):
+            keys = listed(names_of(parsed_json(text)), at_most=_LISTED_NAMES)
+            in_text = f"; in {name}, a text of JSON, {name}.KEY is one of: {keys}"
     return (
         f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {fields}{in_text}"

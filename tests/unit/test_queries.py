@@ -118,11 +118,16 @@ def test_a_robot_that_is_faster_than_is_taken_for_plausible_is_told_the_setting(
     assert "plausible" not in str(reply.get("notes"))
 
 
-@pytest.mark.parametrize("step", ['{"step": "heat"}', "heat"], ids=["JSON", "text"])
-def test_a_key_of_a_text_of_json_is_said_to_be_no_field(tmp_path: Path, step: str) -> None:
-    memory = remembered(tmp_path, [text(1_784_000_000 * 10**9, step, "/task")])
-    window = {"topic": "/task", "start": 1_784_000_000, "end": 1_784_000_001}
-    hint = "data is a text of JSON: a condition, changes, by value and with may be on data.step"
-    for field in ("step", "data.step", "value.step"):
-        reply = asked(memory, "get_topic_in_range", **window, fields=[field])
-        assert reply["detail"].endswith(hint) == (step != "heat")
+def test_fields_go_on_into_a_text_of_json(tmp_path: Path) -> None:
+    """A key that one of the messages lacks is null there, with a note."""
+    said = ('{"step": {"name": "heat", "pans": [{"id": 7}, {"id": 9}]}}', '{"done": true}', "idle")
+    memory = remembered(tmp_path, [text(T0 + n * S, one, "/task") for n, one in enumerate(said)])
+    window = {"topic": "/task", "start": T0 // S, "end": T0 // S + 1}
+    fields = ["data.step.name", "value.step.pans.1.id", "data.step.pans.id"]
+    reply = asked(memory, "get_topic_in_range", **window, fields=fields)
+    assert [row[1:] for row in reply["rows"]] == [["heat", 9, [7, 9]], [None] * 3]
+    assert "data.step.name: this message has no such field" in str(reply)
+    refused = asked(memory, "get_topic_at_time", topic="/task", timestamp=T0 // S, fields=["step"])
+    assert refused["detail"].endswith("in data, a text of JSON, data.KEY is one of: step")
+    plain = {"topic": "/task", "timestamp": T0 // S + 2, "fields": ["data.step"]}
+    assert asked(memory, "get_topic_at_time", **plain)["error"] == "invalid_arguments"

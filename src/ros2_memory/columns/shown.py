@@ -381,7 +381,8 @@ def _field(node: Node, name: str, *, parts: bool) -> Node | None:
     if isinstance(node, dict) and name in node:
         return node[name]
     is_time = isinstance(node, Leaf) and node.conversion is Conversion.SECONDS
-    if node is UNKNOWN or isinstance(node, Summary) or is_time:
+    is_text = isinstance(node, Leaf) and node.kind is Kind.TEXT  # which may be JSON
+    if node is UNKNOWN or isinstance(node, Summary) or is_time or is_text:
         raise UnknownShapeError(f"{name} is in a part that is not shown as it is")
     xyzw = xyzw_of(node) if parts and isinstance(node, dict) else []
     return dict(zip("xyzw", xyzw, strict=False)).get(name)

@@ -166,7 +166,7 @@ class HeldValues:
             # Null is a value, as behind the end of a list, unless there is no such field.
             if not self._is_in(newest):
                 message = self._view.bags.decode(newest)
-                self._view.extractor.shown(message, newest.type, [self._field])
+                self._view.extractor.require(message, newest.type, self._field)
         elif isinstance(value, list | dict | None):
             of_field = "" if self._field is None else f"field {self._field} of "
             how = f"as {self._topic}.FIELD" if asked == "with" else "where the tool takes fields"
@@ -390,15 +390,11 @@ class HeldValues:
 
     def _field_of(self, message: object, type_name: str, field: str) -> JsonValue:
         """Returns a field, which may go on into a text of JSON; a blank text says it has none."""
-        value = self._view.extractor.exact_at(message, type_name, field)
-        segments = field.split(".")
-        for nth in range(1, len(segments) if value is None else 0):
-            text = self._view.extractor.exact_at(message, type_name, ".".join(segments[:nth]))
-            if isinstance(text, str):
-                rest = ".".join(segments[nth:])
-                found: list[JsonValue] = at_field(text, rest) if text.strip() else [text]
-                return found[0] if len(found) == 1 else found or None
-        return value
+        text, below = self._view.extractor.text_above(message, type_name, field)
+        if not below:
+            return self._view.extractor.exact_at(message, type_name, field)
+        found: list[JsonValue] = at_field(text, ".".join(below)) if text.strip() else [text]
+        return found[0] if len(found) == 1 else found or None
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""
