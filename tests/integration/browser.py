@@ -123,6 +123,10 @@ class Browser:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._devtools("Emulation.setEmulatedMedia", {"features": [scheme]})
 
+    def timezone(self, name: str) -> None:
+        """Where its user is; empty: where it runs."""
+        self._devtools("Emulation.setTimezoneOverride", {"timezoneId": name})
+
     def screenshot(self) -> bytes:
         """As PNG."""
         taken = self._devtools("Page.captureScreenshot", {})

@@ -379,6 +379,25 @@ RECKONED: dict[str, tuple[str, object]] = {
         """,
         [False, True, True],
     ),
+    "an open page forgets the exact path and the numbers from before its span": (
+        """
+        const line = (...t) => ({ t, x: t, y: t, until: t.at(-1) });
+        const path = continuedBy({ ...line(1, 2, 3, 4), begins: [0, 2] },
+        { ...line(3, 4, 5, 6), begins: [0, 3] }, 2);
+        const bins = (...t) => ({ t, low: t, mean: t, high: t });
+        return [path.x, path.begins, path.until,
+        joined(bins(1, 2, 3), { ...bins(3, 4), from: 3 }, 2).mean]
+        """,
+        [[2, 3, 4, 5, 6], [1, 4], 6, [2, 3, 4]],
+    ),
+    "where no server answers it says so": (
+        """
+        const before = fetch; fetch = () => Promise.reject(new TypeError('Failed to fetch'));
+        return asked('/page/span', {}).catch((error) => error.message)
+        .finally(() => { fetch = before; })
+        """,
+        "The server does not answer.",
+    ),
     "sizes": (
         "return [0.000064, 0.002, 0.53, 12.345].map(size)",
         ["64 kB", "2 MB", "530 MB", "12.3 GB"],
@@ -392,6 +411,32 @@ def test_what_the_page_reckons_itself(page: Browser) -> None:
         name: page.run(f"return (() => {{{script}}})()") for name, (script, _) in RECKONED.items()
     }
     assert found == {name: right for name, (_, right) in RECKONED.items()}
+
+
+TICKS = """
+  const texts = [], [start, end] = arguments;
+  const pen = new Proxy({}, { set: () => true,
+    get: (_, name) => name === 'fillText' ? (text) => texts.push(text) : () => {} });
+  const drawn = { span: { start, end }, wide: 1000, x: () => 500 };
+  Timeline.prototype.drawTicks.call(drawn, pen, 100, 200);
+  return texts.slice(0, -2);  // below them are the dates of the ends
+"""
+
+
+def test_days_of_the_timeline_begin_at_midnight_also_after_clocks_were_set(
+    chromium: Browser, served: Served
+) -> None:
+    """In Berlin, on 2026-10-25 at 3:00, clocks are set back to 2:00."""
+    day_s, midnight_s = 86_400, 1_792_533_600  # 2026-10-21
+    chromium.timezone("Europe/Berlin")
+    try:
+        show(chromium, served)
+        ticks = chromium.run(TICKS, midnight_s - 1, midnight_s + 7 * day_s)
+        hours = chromium.run(TICKS, midnight_s + 4 * day_s - 1, midnight_s + 5 * day_s)
+    finally:
+        chromium.timezone("")
+    assert [re.sub(r"\D", "", tick) for tick in ticks] == [str(day) for day in range(21, 28)]
+    assert hours[1:] == [f"{hour:02}:00" for hour in range(3, 24, 3)]
 
 
 def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:

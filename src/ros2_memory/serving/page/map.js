@@ -23,14 +23,14 @@ function lastBefore(times, t) {
 const meet = (one, other) => one.x < other.x + other.w + 3 && other.x < one.x + one.w + 3
   && one.y < other.y + other.h && other.y < one.y + one.h;
 
-/* An exact path, and what came since. */
-function continuedBy(known, more) {
-  const first = more.t.findIndex((each) => each > known.until);
-  if (first < 0) return { ...known, until: Math.max(known.until, more.until || 0) };
-  const both = (name) => [...known[name], ...more[name].slice(first)];
-  return { ...more, exact: known.exact && more.exact, t: both("t"), x: both("x"), y: both("y"),
-    begins: [...known.begins, ...more.begins.filter((each) => each >= first)
-      .map((each) => each - first + known.t.length)] };
+/* An exact path from a time on, and what came since. */
+function continuedBy(known, more, start) {
+  const [from, newer] = [lastBefore(known.t, start - SAME_S) + 1, lastBefore(more.t, known.until) + 1];
+  const both = (name) => [...known[name].slice(from), ...more[name].slice(newer)];
+  const after = (begins, first, by) => begins.filter((each) => each >= first).map((each) => each - by);
+  return { ...known, exact: known.exact && more.exact, until: Math.max(known.until, more.until || 0),
+    t: both("t"), x: both("x"), y: both("y"),
+    begins: [...after(known.begins, from, from), ...after(more.begins, newer, newer + from - known.t.length)] };
 }
 
 class RobotMap {
@@ -92,7 +92,7 @@ class RobotMap {
     return isIn && box.pixel * this.scale <= LARGER ? found : null;
   }
   enlarge(box, reply, since, of) {
-    const found = since !== null && this.exact ? continuedBy(this.exact, reply) : reply;
+    const found = since !== null && this.exact ? continuedBy(this.exact, reply, this.view.start) : reply;
     this.exact = { ...found, box, of, starts: new Set(found.begins) };
     if (this.t !== null) this.place(this.t);
     this.draw();

@@ -8,7 +8,9 @@ class Locked extends Error {}
 async function fetched(path, given = {}) {
   const headers = { ...given.headers };
   if (token) headers.Authorization = "Bearer " + token;
-  const response = await fetch(path, { ...given, headers, cache: "no-store", credentials: "omit" });
+  const response = await fetch(path, { ...given, headers, cache: "no-store", credentials: "omit" }).catch((error) => {
+    throw error.name === "AbortError" ? error : new Error("The server does not answer.");
+  });
   if (response.status === 401) throw new Locked(await response.text());
   if (!response.ok) throw new Error(`${response.status}: ${await response.text()}`);
   return response.json();

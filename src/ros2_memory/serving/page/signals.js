@@ -33,7 +33,7 @@ class Plots {
       const name = nameOf(answer);
       if (!this.names.includes(name)) continue;
       const before = this.shown.get(name);
-      const merged = isMore && before ? joined(before.answer, answer) : answer;
+      const merged = isMore && before ? joined(before.answer, answer, this.span.start) : answer;
       if (before && before.plot && merged.t) {
         before.answer = merged;
         before.plot.setData(columns(merged));
@@ -116,12 +116,12 @@ class Plots {
   }
 }
 
-/* What is known, and what came since: the newer answer begins at `from`. */
-function joined(before, more) {
+/* What is known from a time on, and what came since: the newer answer begins at `from`. */
+function joined(before, more, start) {
   if (!more.t) return before.t ? before : more;
   if (!before.t) return more;
-  const kept = before.t.filter((each) => each < more.from).length;
-  const both = (key) => [...before[key].slice(0, kept), ...more[key]];
+  const isShown = before.t.map((each) => each >= start && each < more.from);
+  const both = (key) => [...before[key].filter((_, n) => isShown[n]), ...more[key]];
   return { ...before, t: both("t"), low: both("low"), mean: both("mean"), high: both("high") };
 }
 /* Columns for uPlot, with a hole where nothing came for much longer than usual. */

@@ -265,16 +265,18 @@ class Timeline {
   drawTicks(c, bottom, height) {
     const { start, end } = this.span;
     const by = SPANS.find((each) => (end - start) / each <= this.wide / 90) || SPANS.at(-1);
-    const ahead = -new Date(start * 1000).getTimezoneOffset() * 60;
+    const ahead = (t) => -new Date(t * 1000).getTimezoneOffset() * 60;
+    const unix = (wall) => wall - ahead(wall - ahead(wall));
     c.strokeStyle = colour("grid");
     c.lineWidth = 1;
     c.beginPath();
     const labels = [];
-    for (let t = Math.ceil((start + ahead) / by) * by - ahead; t < end; t += by) {
+    for (let wall = Math.ceil((start + ahead(start)) / by) * by; unix(wall) < end; wall += by) {
+      const t = unix(wall);
       const x = Math.round(this.x(t)) + 0.5;
       c.moveTo(x, OVERVIEW + 4);
       c.lineTo(x, bottom);
-      const isDay = (t + ahead) % 86400 === 0;
+      const isDay = wall % 86400 === 0;
       labels.push([x, by > MONTH_S ? MONTH.format(t * 1000) : isDay ? DAY.format(t * 1000) : by < 60 ? timeOfDay(t) : MINUTE.format(t * 1000)]);
     }
     c.stroke();
