@@ -148,6 +148,19 @@ def test_pointing_at_a_time_or_at_the_path_puts_the_robot_there_and_lists_what_i
     page.point("#timeline", 1, 1)
 
 
+def test_what_is_no_time_is_ignored_in_the_address_and_in_a_form(
+    page: Browser, served: Served
+) -> None:
+    show(page, served, "#at=1e300&last=600")
+    assert page.run("return [state.t, state.last]") == [None, 600]
+    assert page.run("return document.getElementById('trouble').hidden")
+    choose(page, "get_position_at")
+    page.run("document.getElementById('field-timestamp').focus()")
+    page.run("document.activeElement.value = ''")
+    page.keys("1784000000000000000")  # nanoseconds
+    assert "1784000000000000000" in page.run("return document.activeElement.value")
+
+
 def test_a_time_that_was_chosen_stays_and_is_in_the_address(page: Browser, served: Served) -> None:
     page.press("#timeline", *page.run("return [line.x(arguments[0]), 60]", T0_S + 5))
     page.awaits("return location.hash.includes('at=')")
@@ -389,6 +402,14 @@ RECKONED: dict[str, tuple[str, object]] = {
         joined(bins(1, 2, 3), { ...bins(3, 4), from: 3 }, 2).mean]
         """,
         [[2, 3, 4, 5, 6], [1, 4], 6, [2, 3, 4]],
+    ),
+    "identifiers of 64 bits keep their digits in questions and replies": (
+        """
+        const id = '9223372036854775811';
+        return [exactly(`{"id":${id},"x":1.5}`), given({ type: ['string', 'number'] }, id)]
+        .map((each) => JSON.stringify(each))
+        """,
+        ['{"id":9223372036854775811,"x":1.5}', "9223372036854775811"],
     ),
     "where no server answers it says so": (
         """

@@ -36,7 +36,7 @@ function control(name, schema, required) {
   if (required) input.required = true;
   const about = el("span", { class: "soft", id: id + "-about" });
   const describe = () => {
-    const asTime = TIMES.test(name) && input.value !== "" && Number.isFinite(Number(input.value))
+    const asTime = TIMES.test(name) && input.value !== "" && isTime(Number(input.value))
       ? ` ${clock(Number(input.value))}` : "";
     about.textContent = plain((schema.description || "") + asTime
       + (schema.type === "array" ? " Separated by commas." : ""));
@@ -61,7 +61,7 @@ function given(schema, text) {
   if (schema.type === "array") return text.split(",").map((each) => each.trim()).filter(Boolean);
   if (schema.type === "string" || schema.enum) return text;
   try {
-    const read = JSON.parse(text);
+    const read = exactly(text);
     return read === null || Array.isArray(read) ? text : read;
   } catch {
     return text;
@@ -85,7 +85,7 @@ at("question").addEventListener("submit", async (event) => {
   const begun = performance.now();
   try {
     const reply = state.recording ? await fetched(`/page/moment?${new URLSearchParams({
-      recording: state.recording, tool: tool.name, arguments: JSON.stringify(asked) })}`)
+      recording: state.recording, tool: tool.name, arguments: JSON.stringify(asked) })}`, {}, exactly)
       : await call(tool.name, asked);
     const refused = Boolean(reply && reply.error);
     at("told").textContent = plain(JSON.stringify(reply, null, 2));

@@ -55,7 +55,7 @@ function remember() {
 }
 function readAddress() {
   const given = new URLSearchParams(location.hash.slice(1));
-  const number = (name) => (given.has(name) && Number.isFinite(Number(given.get(name)))
+  const number = (name) => (given.has(name) && isTime(Number(given.get(name)))
     ? Number(given.get(name)) : null);
   const [from, to] = [number("from"), number("to")];
   if (given.get("last") === "all") state.last = "all";

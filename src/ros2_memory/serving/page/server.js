@@ -5,7 +5,12 @@ let token = sessionStorage.getItem(TOKEN) || "";
 
 class Locked extends Error {}
 
-async function fetched(path, given = {}) {
+/* Reads JSON. A whole number of more digits than a number of JavaScript has stays as it is written. */
+function exactly(text) {
+  return JSON.parse(text, (_, value, written) => (JSON.rawJSON && Number.isInteger(value)
+    && !Number.isSafeInteger(value) ? JSON.rawJSON(written.source) : value));
+}
+async function fetched(path, given = {}, read = JSON.parse) {
   const headers = { ...given.headers };
   if (token) headers.Authorization = "Bearer " + token;
   const response = await fetch(path, { ...given, headers, cache: "no-store", credentials: "omit" }).catch((error) => {
@@ -13,7 +18,7 @@ async function fetched(path, given = {}) {
   });
   if (response.status === 401) throw new Locked(await response.text());
   if (!response.ok) throw new Error(`${response.status}: ${await response.text()}`);
-  return response.json();
+  return read(await response.text());
 }
 
 /* Returns an answer of one of the page's own addresses; one that says why there is none is thrown. */
@@ -33,7 +38,7 @@ async function rpc(method, params) {
 }
 async function call(name, given = {}) {
   const result = await rpc("tools/call", { name, arguments: given });
-  return JSON.parse(result.content[0].text);
+  return exactly(result.content[0].text);
 }
 function keepToken(given) {
   token = given;

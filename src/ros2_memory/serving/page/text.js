@@ -67,6 +67,7 @@ const CLOCK = new Intl.DateTimeFormat(undefined,
 const MINUTE = new Intl.DateTimeFormat(undefined,
   { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
 const MONTH = new Intl.DateTimeFormat(undefined, { month: "short", year: "numeric" });
+const isTime = (unix) => Math.abs(unix) <= 8.64e12;  // of later ones there is no date
 const yearOf = (unix) => new Date(unix * 1000).getFullYear();
 let hasYears = false;  // whether what is recorded is of several years
 const day = (unix) => (hasYears ? DATE : DAY).format(unix * 1000);
