@@ -212,8 +212,12 @@ class Dispatcher:
                     lambda: Reply(to_json_text(work(call))),
                 )
         except EpisodicError as error:
-            return self._replies.error(error)
+            return self.refusal(error)
         return reply
+
+    def refusal(self, error: EpisodicError) -> Reply:
+        """Returns the reply to what is refused before it is asked."""
+        return self._replies.error(error)
 
     @contextmanager
     def _running_call(self) -> Iterator[tuple[Call, str]]:
@@ -276,13 +280,8 @@ class Dispatcher:
         question = tool.question(given)
 
         def answer() -> Reply:
-            memory = self.memory if part is None else part()
-            try:
-                result = question(memory, call)
-            except GoneError:  # the store has changed since, and is looked at anew
-                result = question(memory, call)
             return self._replies.answer(
-                result,
+                question(self.memory if part is None else part(), call),
                 from_active=call.used_active,
                 from_memory=call.used_thinned,
                 now=call.now,
@@ -328,7 +327,10 @@ class Dispatcher:
         # Around all of it: an error keeps what was read alive until it has become a reply.
         with call.reading(self.memory.large):
             try:
-                done = "ok", answer()
+                try:
+                    done = "ok", answer()
+                except GoneError:  # the store has changed since, and is looked at anew
+                    done = "ok", answer()
             except QueryTimeoutError as error:
                 timeout = QueryTimeoutError(
                     f"{error}{_note_on_wait(waited_s)}", error.searched_back_to

@@ -28,6 +28,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import Sample
+from ros2_memory.core.reply import JsonObject
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.results import Answer
 from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
@@ -128,6 +129,19 @@ async def test_a_question_whose_columns_were_deleted_meanwhile_is_asked_again(
         reply = sent(await client.call_tool("ask", {}))
     assert answer in reply
     assert reply.get("error") in {None, "busy"}
+
+
+async def test_the_page_looks_again_where_columns_were_deleted_meanwhile() -> None:
+    looks = itertools.count()
+
+    def look(_call: Call) -> JsonObject:
+        if next(looks) == 0:
+            raise GoneError
+        return {"value": 1}
+
+    dispatcher = Dispatcher(NOBODY, [], Replies(Path("bags"), 24_000), call_timeout_s=5)
+    assert json.loads((await dispatcher.look(look)).text) == {"value": 1}
+    dispatcher.stop()
 
 
 @pytest.mark.parametrize(

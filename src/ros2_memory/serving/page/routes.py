@@ -105,7 +105,7 @@ class _PageData:
         try:
             arguments = tool_arguments(given)
         except InvalidArgumentsError as error:
-            return Response(f"{error}\n", 400, headers=_HEADERS)
+            return _json_response(self._dispatcher.refusal(error).text)
         part = partial(self._part, given)
         reply = await self._dispatcher.answer(
             given["tool"], arguments, client, for_page=True, part=part
