@@ -100,7 +100,7 @@ def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
 
 
 def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
-    """Prints the values of a report that are known, each once."""
+    """Prints the values of a report that are known, each once, and the notes of both replies."""
     snapshot = memory.snapshot()
     files = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any(files):
@@ -108,9 +108,12 @@ def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
         return
     values = {key: value for part in report.values() for key, value in filled_leaves(part).items()}
     for key, value in [*values.items()]:
-        if value in (None, []) or key.endswith("_local"):
+        if value in (None, []) or key.endswith("_local") or key == "notes":
             del values[key]
     print_reply(values)
+    lists = [part.get("notes") for part in report.values()]
+    notes = (str(note) for listed in lists if isinstance(listed, list) for note in listed)
+    print_notes(dict.fromkeys(notes))
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:

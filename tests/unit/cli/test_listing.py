@@ -150,6 +150,19 @@ def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
     assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
 
 
+def test_info_has_the_notes_on_robots_and_those_on_files(folder: Path, exits: Program) -> None:
+    bag = folder / "b" / "b_0.mcap"
+    content = bytearray(bag.read_bytes())
+    last = (T0 + 103 * NS_PER_S).to_bytes(8, "little")
+    content[content.rindex(last)] ^= 1  # in its statistics
+    bag.write_bytes(content)
+    for robot, x in (("red", 0.0), ("blue", 9.0)):
+        write_mcap(folder / robot / f"{robot}_0.mcap", seconds(1000, 60, x))
+    notes = exits(0, "info .").err
+    assert "b/b_0.mcap: its summary section does not match its checksum" in notes
+    assert "robots are mixed: blue, red overlap" in notes
+
+
 def test_a_deployment_that_records_there_is_looked_at_as_it_is(
     folder: Path, exits: Program, using: Using
 ) -> None:
