@@ -25,7 +25,7 @@ from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.no_data import nothing_here
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import usual_rate
+from ros2_memory.insights.status import left_open, usual_rate
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.results import TopicRow
 
@@ -191,9 +191,9 @@ def _recording_rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
 
 
 def _files_not_read(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
-    """Yields the files of which no message is read, each with the reason."""
+    """Yields the files of which no message is read, or not all, each with the reason."""
     reasons = dict.fromkeys(snapshot.empty, "no message was recorded")
-    for aside in (*snapshot.damaged, *snapshot.unread):
+    for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread, *left_open(snapshot)):
         reasons[aside.path] = aside.reason
     for path in sorted(reasons):
         yield {"file": str(path).removeprefix(f"{root}/"), "reason": reasons[path]}

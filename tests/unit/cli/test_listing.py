@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import AbstractContextManager, closing
 from datetime import datetime
 from functools import partial
@@ -30,7 +31,7 @@ from ros2_memory.columns import database
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
@@ -207,7 +208,15 @@ def test_recordings_says_whose_they_are_and_names_what_is_not_read(
     write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
     assert "not_read" not in exits(0, "recordings .").out
     (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
-    os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
+    killed = McapLayout(chunk_size=1_000, finish=False)
+    unfinished = write_mcap(folder / "c" / "c_2.mcap", seconds(310, 9), killed)
+    for path in (folder / "c" / "c_1.mcap", unfinished):
+        os.utime(path, (1_700_000_000,) * 2)
+    write_mcap(folder / "c" / "c_3.mcap", [text(time.time_ns(), "now")], killed)
+    reasons = {row["file"]: row["reason"] for row in exits(0, "recordings . --json").json[5:]}
+    assert [*reasons] == ["c/c_1.mcap", "c/c_2.mcap", "c/c_3.mcap"]
+    assert reasons["c/c_2.mcap"].startswith("the file ends early")
+    assert reasons["c/c_3.mcap"] == "still being written"
     found = rows(exits)
     assert (found["a"]["whose"], found["c"]["whose"]) == ("this recorder", "another recorder")
     assert "c/c_1.mcap" in exits(0, "recordings .").out
