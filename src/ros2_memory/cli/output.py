@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import math
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from pathlib import Path
 from shutil import get_terminal_size
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
@@ -22,7 +24,6 @@ from ros2_memory.core.timebase import NS_PER_US, local_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
@@ -64,20 +65,18 @@ def atomic_file(path: Path) -> Iterator[Path]:
         BagError: the block raised one; an error of the temporary file names `path` instead.
         OSError: the block raised one, or the file cannot be renamed; the error names `path`.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        temporary.unlink(missing_ok=True)
-        yield temporary
-        temporary.replace(path)
-    except BagError as error:
-        if error.path != str(temporary):
-            raise
-        raise BagError(str(path), error.reason) from error
+        with TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as folder:
+            temporary = Path(folder, "written")
+            try:
+                yield temporary
+            except BagError as error:
+                if error.path != str(temporary):
+                    raise
+                raise BagError(str(path), error.reason) from error
+            temporary.replace(path)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -1,10 +1,11 @@
 """Replies as people read them, in a terminal of 80 columns and in a wide one."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from ros2_memory.cli.output import format_time, format_value, print_reply
+from ros2_memory.cli.output import atomic_file, format_time, format_value, print_reply
 from ros2_memory.core.model import JsonValue
 from tests.support.program import Printed
 
@@ -74,3 +75,14 @@ def test_however_narrow_a_terminal_is_nothing_of_a_table_is_cut(shown: Shown, wi
     output = "".join(shown([{"topic": "/a_long_name" * 5, "count": 12345}], width).out.split())
     assert "12345" in output
     assert "/a_long_name" * 5 in output.replace("12345", "")
+
+
+def test_of_two_programs_that_write_a_file_at_once_each_writes_a_whole_one(tmp_path: Path) -> None:
+    path = tmp_path / "window.mcap"
+    with atomic_file(path) as first:
+        first.write_text("all of the first")
+        with atomic_file(path) as second:
+            second.write_text("all of the second")
+        assert path.read_text() == "all of the second"
+    assert path.read_text() == "all of the first"
+    assert [*tmp_path.iterdir()] == [path]
