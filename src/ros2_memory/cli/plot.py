@@ -49,6 +49,8 @@ _SHORTEST_S: Final = 0.001
 """A recap needs some length."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
+_MOST_FIELDS: Final = 20
+"""Fields of one picture: 300 rows take minutes to lay out."""
 _PERIODS: Final = 5
 """A step of a signal that is longer than so many usual ones, and than a second, is a gap."""
 _STYLE: Final = {
@@ -169,6 +171,8 @@ def plot_signal(
     picture: Picture,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
+    if len(field) > _MOST_FIELDS:
+        raise InvalidArgumentsError(f"{len(field)} fields; at most {_MOST_FIELDS} are drawn")
     shown = picture.open_window()
     name = resolve_topic(shown.view, topic)
     with spinner(f"reading {name}"):

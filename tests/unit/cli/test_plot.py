@@ -141,6 +141,7 @@ def test_a_picture_is_of_the_time_that_was_asked_for(bags: Path) -> None:
         ("path --out path.jpeg", "must end in .svg, .png"),
         ("signal /chatter --out a.svg --field data", "holds no number"),
         ("signal /odom --out a.svg --field pose.no", "has no field"),
+        (f"signal /odom --out a.svg {'--field position.x ' * 21}", "at most 20 are drawn"),
         ("timeline --out a.svg --end 2001-01-01", "nothing was recorded in this"),
     ],
 )
