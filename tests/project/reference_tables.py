@@ -376,33 +376,19 @@ def _is_log(node: ast.AST) -> bool:
 
 
 def event_list(page: str) -> str:
-    """The log events by level, with their own fields, and what the page says that they mean.
-
-    Those of which it says nothing, since their names do, stand together at the end of a level,
-    without their fields.
-    """
+    """The log events whose meaning a page says, by level, with their own fields."""
     written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
-    plain = {
-        *re.findall(
-            r"`(\w+)`", "".join(re.findall(r"^Also .+?\.$", page, re.MULTILINE | re.DOTALL))
-        )
-    }
-    told: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
-    named: dict[str, list[str]] = {level: [] for level in told}
+    lines: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
     every = events()
-    for name in dict.fromkeys(each.name for each in every):
+    for name in [name for name in dict.fromkeys(each.name for each in every) if name in written]:
         same = [each for each in every if each.name == name]
-        worst, *others = [level for level in told if level in {each.level for each in same}]
+        worst, *others = [level for level in lines if level in {each.level for each in same}]
         fields = dict.fromkeys(field for each in same for field in each.fields)
         inside = [f"or {level}" for level in others]
         inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
         shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
-        if name in plain and name not in written:
-            named[worst].append(f"`{name}`" + "".join(f" (or {level})" for level in others))
-        else:
-            told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
+        lines[worst].append(f"- {shown_name}: {written[name]}")
     parts = []
-    for level, lines in told.items():
-        also = textwrap.wrap(f"Also {', '.join(named[level])}.", 116) if named[level] else []
-        parts += [f"## {level.capitalize()}", "\n".join(lines), "\n".join(also)]
+    for level, listed in lines.items():
+        parts += [f"## {level.capitalize()}", "\n".join(listed)]
     return "\n\n".join(parts)

@@ -14,9 +14,8 @@ from typing import Any
 
 import anyio
 
-from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
+from ros2_memory.bag_dir.layout import MOMENT_FILE
 from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_saved_moment
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
@@ -149,13 +148,10 @@ def replies(bag_dir: Path) -> dict[str, str]:
 def shown_files(bag_dir: Path) -> dict[str, str]:
     """The recorder's own files of that history, by name."""
     heartbeat(bag_dir, NOW)
-    cut = (START_S + 60) * NS_PER_S
-    overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
-    write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
     start = (START_S + 34) * NS_PER_S
     request = SaveRequest("5f0c" * 8, "scissors found", start, NOW, NOW)
     write_saved_moment(bag_dir, SavedMoment(request, pending=False))
-    names = (HEARTBEAT_FILE, HANDOVER_FILE, MOMENT_FILE)
+    names = (HEARTBEAT_FILE, MOMENT_FILE)
     return {name: (bag_dir / name).read_text() for name in names}
 
 
