@@ -15,9 +15,7 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice, zip_longest
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
@@ -25,7 +23,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 from ros2_memory.analysis.facts import has_errors
 from ros2_memory.analysis.motion.trajectory import length_notes
 from ros2_memory.analysis.sights import Spot, apart_m
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.spans import united, without
@@ -40,7 +38,6 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View, clamped, open_view
 from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.recap import events_by_topic
@@ -52,6 +49,7 @@ from ros2_memory.places.pose_frames import (
     is_one_run,
     known_placement,
     known_track,
+    origin_notes,
     places_in,
 )
 from ros2_memory.places.where import Where, note_unplaced, parse_where, places_asked
@@ -84,7 +82,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.core.model import Vector3
     from ros2_memory.history.context import Call, Memory
 
 _Kind: TypeAlias = Literal[
@@ -109,9 +106,6 @@ _LEAST_RECORDED_S: Final = 10.0
 _MOST_SCATTERED: Final = 300
 _OF_WINDOWS: Final = ("from start to end: ", "from with_start to with_end: ")
 """How notes on one of the two windows begin."""
-_FIXED_FRAMES: Final = frozenset({"earth", "utm"})
-"""Frames of REP 105 and of robot_localization that are at rest on earth."""
-_SAME_ORIGIN_M: Final = 0.5
 _SAME_MOVER_M: Final = 1.0
 """People and pets that were last seen so near to where they were before are where they were."""
 
@@ -264,7 +258,7 @@ def _compare_things(sides: tuple[_Side, _Side], where: Where | None) -> tuple[st
     )
     view.notes.add(*blind_notes(things, (earlier, later)))
     note_other_frames(view, things, where)
-    view.notes.add(*_origin_notes(view, earlier, later))
+    view.notes.add(*origin_notes(view, view.pose_topic, (earlier, later)))
     epochs = [instance.epoch for instance in things.estimate.instances]
     frame = things.frames[epochs[0] if epochs else 0]
     why_not = _why_incomparable(first, second)
@@ -307,26 +301,6 @@ def _compared_with_notes(view: View, between: _ThingsBetween) -> ComparedThings:
     instances = (thing for thing in things.estimate.instances if thing.label in missed)
     view.notes.add(*renamed_notes(things, islice(instances, _MOST_SCATTERED)))
     return compared
-
-
-def _origin_notes(view: View, earlier: TimeWindow, later: TimeWindow) -> Iterator[str]:
-    """Yields a sentence if the map lay elsewhere on earth in one of two windows."""
-    map_frame = view.limits.map_frame
-    for frame in sorted(_FIXED_FRAMES - {map_frame}):
-        places: list[Vector3] = []
-        for window in (earlier, later):
-            newest = view.stream.newest(view.pose_topic, window)
-            if newest is not None and map_frame is not None:
-                with suppress(NoDataError):
-                    at, recording = newest.time, newest.recording
-                    found = transform_at(view, map_frame, frame, at, recording, explains=False)
-                    places.append(found.transform.translation)
-        if len(places) == 2 and (away_m := math.dist(*places)) > _SAME_ORIGIN_M:
-            yield (
-                f"{frame} is {away_m:.2f} m elsewhere in {map_frame} than before, as of a map that "
-                "was laid out anew: its coordinates name other places than before; "
-                f"data.map_frame={frame} makes them comparable"
-            )
 
 
 def _are_of_one_run(sides: tuple[_Side, _Side]) -> bool:

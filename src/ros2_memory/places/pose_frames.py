@@ -72,6 +72,11 @@ _NEAR_NS: Final = 60 * NS_PER_S
 """Transforms that lead to a place so long before or after make it unknown, and not nowhere."""
 NEWEST_POSE_NS: Final = SILENCE_NS
 """After so long without a pose the robot may have moved."""
+_FIXED_FRAMES: Final = frozenset({"earth", "utm"})
+"""Frames of REP 105 and of robot_localization that are at rest on earth."""
+_SAME_ORIGIN_M: Final = 0.5
+_MOST_ORIGINS: Final = 12
+"""At most this many recordings, evenly spaced, are asked where their map lay."""
 _OLD_NS: Final = NS_PER_S
 _OLD_PERIODS: Final = 3
 """A pose is old after so long, and so many times the time since the one before it."""
@@ -414,8 +419,10 @@ def changing_origin(frame_id: str) -> str:
 
 
 def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None:
-    """Notes if positions outside of the map are of several runs of odometry."""
-    if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
+    """Notes if positions are of several runs of odometry, or in a map that was laid out anew."""
+    if frame_id == view.limits.map_frame:
+        view.notes.add(*origin_notes(view, topic, [window]))
+    elif not is_one_run(view, topic, [window]):
         root = root_above(view, frame_id)
         is_map = root is not None and root == view.limits.map_frame
         leads = f"; ask with frame_id={root}" if is_map else map_to_choose(view, frame_id)
@@ -423,6 +430,33 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
             f"{changing_origin(frame_id)}, and these are several: the same coordinates may be "
             f"another place in each{leads}"
         )
+
+
+def origin_notes(view: View, topic: str, windows: Iterable[TimeWindow]) -> Iterator[str]:
+    """Yields a sentence if the map lay elsewhere on earth in some recording of poses in windows."""
+    map_frame, recordings = view.limits.map_frame, view.timeline.recordings(topic)
+    if map_frame is None:
+        return
+    ends = sorted(
+        (min(last, window.stop - 1), max(first, window.start), recording)
+        for window in windows
+        for recording, (first, last) in recordings.items()
+        if window.overlaps(first, last)
+    )
+    for frame in sorted(_FIXED_FRAMES - {map_frame}):
+        places: list[tuple[Ns, Vector3]] = []
+        for at, since, recording in ends[:: -(-len(ends) // _MOST_ORIGINS) or 1]:
+            with suppress(NoDataError, QueryTimeoutError):
+                found = transform_at(view, map_frame, frame, at, recording, explains=False)
+                places.append((since, found.transform.translation))
+        for since, place in places:
+            if (away_m := math.dist(place, places[0][1])) > _SAME_ORIGIN_M:
+                yield (
+                    f"{frame} is {away_m:.2f} m elsewhere in {map_frame} than before "
+                    f"{unix_text(since)}, as of a map that was laid out anew: its coordinates name "
+                    f"other places than before; data.map_frame={frame} makes them comparable"
+                )
+                break
 
 
 def map_to_choose(view: View, frame_id: str) -> str:

@@ -22,6 +22,7 @@ from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import ANY_TIME, TimeRange, clamped, open_search
+from ros2_memory.places.pose_frames import origin_notes
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, UsualPlace
 from ros2_memory.things.instances import (
@@ -104,6 +105,8 @@ def find_things(
     known = known_things(view, lowest, window)
     view.notes.retract_outside(asked_window)
     note_other_frames(view, known, region)
+    if known.has_map:
+        view.notes.add(*origin_notes(view, view.pose_topic, [window]))
     finder = _Finder(known, window, region, places_asked(limits, region, known.frames), now)
     wanted = {known.labels.key(label): label for label in labels}
     found = sorted(finder.find(wanted), key=lambda thing: (-thing.last, thing.label, thing.place))

@@ -151,6 +151,10 @@ def test_a_map_that_was_laid_out_anew_between_two_days_is_said_to_be(
     later = {"start": BEGIN + 120, "end": BEGIN + 149}
     same = ask(tmp_path, "compare", with_start=BEGIN + 60, with_end=BEGIN + 89, **later)
     assert "elsewhere" not in str(same.get("notes"))
+    for tool, at in (("find_things", {"label": "mug"}), ("visits", {"x": 0, "y": 0})):
+        assert note in str(ask(tmp_path, tool, **at)["notes"])
+        alone = ask(tmp_path, tool, start=BEGIN + 60, **at)
+        assert "elsewhere" not in str(alone.get("notes"))
 
 
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
