@@ -745,17 +745,21 @@ def _most_important(
     """Returns at most `most` events, in order of time: the most important, the longest of a kind.
 
     What happens on any day comes last, the rare before the frequent: two changes of an emergency
-    stop, then the stops, then a door that opens all the time. `counts` has how many there are of
-    each kind; there may be more than `events`. The `rare` ones displace only what happened more
-    often than there may be of them. A note says how many are left out; one alone is not.
+    stop, then the stops, then a door that opens all the time. Of a boolean the value comes first
+    that held for less time in all. `counts` has how many there are of each kind; there may be more
+    than `events`. The `rare` ones displace only what happened more often than there may be of them.
+    A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))
+    lasted = {event: (event.end or event.start) - event.start for event in events}
+    held = Counter[str]()
+    for event in events:
+        held[event.text] += lasted[event] if event.kind == "flip" else 0
 
-    def rank(event: Event) -> tuple[int, int, int, Ns]:
+    def rank(event: Event) -> tuple[int, int, int, Ns, Ns]:
         kind, often = _KINDS.index(event.kind), alike[_boolean_of(event) or event.kind]
         often = min(often, _MOST_RARE) if event in rare else often
-        lasted = (event.end or event.start) - event.start
-        return min(kind, _OF_ANY_DAY), often, kind, -lasted
+        return min(kind, _OF_ANY_DAY), often, kind, held[event.text], -lasted[event]
 
     if counts.total() == len(events) == most + 1:
         most += 1

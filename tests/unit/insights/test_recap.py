@@ -297,6 +297,13 @@ def test_of_many_stops_and_toggles_the_rare_are_listed_first(tmp_path: Path) -> 
     assert f"{34 - (MOST_EVENTS - 2)} stops, {34 * 8 // 3} on/off changes" in left_out
 
 
+def test_of_a_lid_that_is_mostly_closed_the_openings_are_listed_first(tmp_path: Path) -> None:
+    lid = [boolean(BEGIN + at * S, at % 9 in {4, 5}, topic="/lid") for at in range(9 * MOST_EVENTS)]
+    told = over(remembered(tmp_path, lid), 0, 9 * MOST_EVENTS)
+    assert [event.text for event in told.events] == ["/lid became true"] * MOST_EVENTS
+    assert dict(told.counts) == {"on/off changes": 2 * MOST_EVENTS}
+
+
 @pytest.mark.parametrize(("hours", "is_listed"), [(60, True), (40, False)])
 def test_a_thing_that_was_seen_once_in_days_is_listed_beside_what_happens_all_the_time(
     tmp_path: Path, hours: int, is_listed: bool
