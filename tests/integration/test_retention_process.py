@@ -23,7 +23,16 @@ from ros2_memory.bag_dir.state_files import LEAVING, Leaving
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Memory, QuerySettings
 from tests.integration.test_recorder_daemon import sited
-from tests.support.bags import McapLayout, mcap_content, odom, text, tf, transform, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    along_x,
+    mcap_content,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.examples import LONG
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import keeper_of, own_all, size_of, state
@@ -223,7 +232,7 @@ def test_days_are_kept_by_the_recorder_and_go_with_the_setting(tmp_path: Path) -
     with sited(tmp_path) as site:
         for number in range(3):
             start = two_days_ago + number * 10 * NS_PER_S
-            poses = [odom(start + n * NS_PER_S // 100, n / 400, 0.0) for n in range(1000)]
+            poses = along_x(start, 10, mps=0.25, hz=100)
             write_mcap(site.bag_dir / "rec_old" / f"rec_old_{number}.mcap", poses)
         own_all(site.bag_dir)
         keeping = site.run("memory.keep=true", "retention.max_total_gb=0.0005")

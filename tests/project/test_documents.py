@@ -27,7 +27,7 @@ from ros2_memory.bootstrap import exclusions_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.serving.web_app import STREAM_PATH
-from tests.support.bags import odom, text, write_mcap
+from tests.support.bags import along_x, odom, text, write_mcap
 from tests.support.documented_history import START_S, write_history
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import own_all
@@ -309,7 +309,7 @@ NOT_HERE = ("ros2-memory --install-completion", "ros2-memory-recorder")
 def terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot's bag, of which the clock and the words fit what the pages ask."""
     names = ("/vision/scene/scene_objects", "/camera/front", "/mic")
-    messages = [odom(T0 + n * NS_PER_S // 10, n / 10, 0.0) for n in range(101)]
+    messages = along_x(T0, 10.1, mps=1.0, hz=10)
     messages += [text(T0 + NS_PER_S, "scissors", name) for name in names]
     write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", messages)
     own_all(tmp_path / "bags")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import odom, text, write_mcap
+from tests.support.bags import along_x, text, write_mcap
 from tests.support.housekeepers import own_all
 
 T0 = 1_700_000_000 * NS_PER_S
@@ -40,7 +40,7 @@ PEOPLE = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
 
 @pytest.fixture
 def env(tmp_path: Path) -> dict[str, str]:
-    messages = [odom(T0 + n * NS_PER_S, float(n), 0.0) for n in range(5)]
+    messages = along_x(T0, 5, mps=1.0)
     write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", [*messages, text(T0, "a word")])
     own_all(tmp_path / "bags")
     return {

@@ -18,6 +18,7 @@ from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
     Msg,
+    along_x,
     boolean,
     detections,
     header,
@@ -358,7 +359,7 @@ def test_what_was_read_as_time_ran_out_is_in_the_answer(
 ) -> None:
     """Of three slices of five minutes the second is read as time runs out."""
     begin = T0 - T0 % (300 * S)
-    memory = remembered(tmp_path, [odom(begin + n * S, 0.1 * n) for n in range(900)])
+    memory = remembered(tmp_path, along_x(begin, 900, mps=0.1))
     monkeypatch.setattr(Call, "partial_after", lambda *_: Deadline.after(0))
     reply = asked(memory, "trajectory_summary", start=begin / S, end=begin / S + 900)
     assert (reply["start"], reply["poses"]) == (begin / S + 300, 600)
@@ -368,7 +369,7 @@ def test_what_was_read_as_time_ran_out_is_in_the_answer(
 def test_a_reply_without_visits_says_since_when_it_is_known_where_the_robot_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    memory = remembered(tmp_path, [odom(T0 + n * S, 0.1 * n) for n in range(600)])
+    memory = remembered(tmp_path, along_x(T0, 600, mps=0.1))
 
     def late(*given: Any) -> tuple[list[Any], int]:
         return read_until_late(*given)[0], T0 + 300 * S
@@ -567,7 +568,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
     tmp_path: Path,
 ) -> None:
     """What was found stays, where the robot was is left out."""
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(60)]
+    messages = along_x(T0, 60, mps=0.1)
     messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
     messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
     memory = remembered(tmp_path, messages)
@@ -595,7 +596,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
 
 def test_a_position_says_where_it_is_not_known_which_place_that_is(tmp_path: Path) -> None:
     """The newest pose is newer than the newest transform to the map, as it mostly is: by 1 s."""
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(70)]
+    messages = along_x(T0, 70, mps=0.1)
     messages += [
         tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(50)
     ]
@@ -614,7 +615,7 @@ def test_a_position_says_where_it_is_not_known_which_place_that_is(tmp_path: Pat
 def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
     tmp_path: Path,
 ) -> None:
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(120)]
+    messages = along_x(T0, 120, mps=0.1)
     messages += [
         tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(120)
     ]
@@ -632,7 +633,7 @@ def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
 def test_coordinates_and_a_place_of_one_name_are_two_rows(
     tmp_path: Path, names: tuple[str, str]
 ) -> None:
-    messages = [odom(T0 + n * S, n / 10, 0.0) for n in range(120)]
+    messages = along_x(T0, 120, mps=0.1)
     den = Place("den", "odom", Circle(9.0, 0.0, 1.0))
     memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
     both = {"den": {"x": 3.0, "y": 0.0, "radius_m": 1.0}, "other": "den"}

@@ -14,7 +14,7 @@ from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
-from tests.support.bags import command, detections, odom, text
+from tests.support.bags import along_x, command, detections, odom, text
 from tests.support.closed_form import TURN_RATE, position
 from tests.support.memories import ROOT, asked, memory_of, remembered
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -45,7 +45,7 @@ def test_a_field_that_one_type_of_a_topic_has_is_shown_of_its_messages(tmp_path:
 
 
 def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: Path) -> None:
-    memory = remembered(tmp_path, [odom(T0 + n * S, n, 0.0) for n in range(3)])
+    memory = remembered(tmp_path, along_x(T0, 3, mps=1.0))
     inside = queries.topic_range(memory, Call(), "/odom", span(0, 2))
     assert inside.notes == ()
     wider = queries.topic_range(memory, Call(), "/odom", span(-5, 900))

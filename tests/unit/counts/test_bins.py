@@ -21,6 +21,7 @@ from ros2_memory.counts.bins import MOST_BINS, MOST_DAYS, ClockBin, TimeBins, ti
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import (
     Msg,
+    along_x,
     boolean,
     detected,
     detections,
@@ -142,7 +143,7 @@ def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> Non
     noon = round(datetime(2026, 3, 2, 12, 30).astimezone().timestamp())
     for begin in (noon, noon + 5 * 3600, noon + 3 * 86_400):
         at = begin * S
-        write_mcap(tmp_path / f"{begin}.mcap", [odom(at + n * S, n, 0.0) for n in range(20)])
+        write_mcap(tmp_path / f"{begin}.mcap", along_x(at, 20, mps=1.0))
     memory = memory_of(tmp_path)
 
     def rows(by: str) -> tuple[list[str], list[str]]:

@@ -6,7 +6,16 @@ from typing import Any
 
 import pytest
 
-from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap, write_splits
+from tests.support.bags import (
+    McapLayout,
+    along_x,
+    battery,
+    boolean,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, each_way, memory_of
 from tests.support.tables import table
@@ -83,7 +92,7 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     messages = [boolean(T0 + at * S, at in bumps, BUMPER) for at in range(0, 101, 2)]
     said = ((0, "auto"), (45, "manual"), (70, "auto 2"), (85, "auto 3"))
     messages += [text(T0 + at * S, words, "/mode") for at, words in said]
-    messages += [odom(T0 + at * S, at / 10, 0.0) for at in range(101)]
+    messages += along_x(T0, 101, mps=0.1)
     write_splits(tmp_path, messages, 600, layout=McapLayout(latched=frozenset({"/mode"})))
     memory = memory_of(tmp_path, recalls=recalls)
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
@@ -146,7 +155,7 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     times = [*range(30), *range(45, 80), *range(100, 140), 160, 161, *range(175, 300)]
     bumped = [45 <= at < 130 or 160 <= at < 162 for at in times]
     messages = [boolean(T0 + at * S, *said) for at, *said in zip(times, bumped, strict=True)]
-    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(300)]
+    messages += along_x(T0, 300)
     write_splits(tmp_path, messages, split_s)
 
     def whole(first: int, last: int, by: str = "hour") -> list[float]:
@@ -193,7 +202,7 @@ def test_a_boolean_of_a_rare_topic_lasts_until_it_toggles_back(
     """As of a dock; nothing is recorded from 7999 s on. It lasts as long as with `by`."""
     changes = ((100, False), (4000, True), (5000, False), (6000, True))
     messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
-    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(8000)]
+    messages += along_x(T0, 8000)
     write_splits(tmp_path, messages, 2000)
     found = matches(tmp_path, BUMPER, 0, 10_000, recalls=recalls)["sightings"]
     assert [row["duration_s"] for row in found] == [1999.0, 1000.0]
@@ -260,7 +269,7 @@ def test_a_while_on_a_rare_measurement_ends_where_that_falls_silent(
     tmp_path: Path, recalls: bool
 ) -> None:
     levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
-    moving = [odom(T0 + at * S, 0.0) for at in range(1001)]
+    moving = along_x(T0, 1001)
     other = [boolean(T0 + at * S, True) for at in range(1001)]
     write_splits(tmp_path, [*levels, *moving, *other], 100)
     charged = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}

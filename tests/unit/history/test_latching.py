@@ -17,6 +17,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     boolean,
     in_order,
     log_entry,
@@ -389,7 +390,7 @@ def test_refusals_of_any_text_and_of_a_message_without_one_value_say_what_to_ask
 ) -> None:
     words = [text(T0 + at * S, word) for at, word in enumerate(("hello", "hello", "bye"))]
     logs = [log_entry(T0 + at * S, 20, "nav", f"goal {at}") for at in range(3)]
-    moving = [odom(T0 + at * S, at) for at in range(3)]
+    moving = along_x(T0, 3, mps=1.0)
     write_mcap(tmp_path / "run" / "run_0.mcap", in_order([*words, *logs, *moving]))
     memory = memory_of(tmp_path)
     span = {"start": T0 / S, "end": T0 / S + 2}

@@ -26,6 +26,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     boolean,
     log_entry,
     make,
@@ -268,7 +269,7 @@ def test_the_newest_message_of_a_silent_topic_is_read_without_the_time_after_it(
 
 
 def test_what_a_saved_moment_has_whole_is_not_said_to_be_of_a_thinned_day(tmp_path: Path) -> None:
-    day = [odom(T0 + n * S, float(n)) for n in range(600)]
+    day = along_x(T0, 600, mps=1.0)
     write_mcap(tmp_path / "memory" / f"{utc_day(T0)}.thinned.mcap", day)
     whole = [odom(T0 + 100 * S + n * S // 10, 100 + n / 10) for n in range(300)]
     write_mcap(tmp_path / "moments" / "fall" / "rec" / "rec_0.mcap", whole)

@@ -23,10 +23,10 @@ from ros2_memory.lake.tables import NAMESPACE, TABLES, bags_condition, open_tabl
 from ros2_memory.lake.warehouse import LakeFile, LakeLocation
 from tests.support.bags import (
     Msg,
+    along_x,
     battery,
     detections,
     make,
-    odom,
     text,
     tf,
     transform,
@@ -209,7 +209,7 @@ def test_a_pose_that_cannot_be_decoded_costs_its_bag_alone_the_poses(
 ) -> None:
     """Where messages have too many fields for columns, those of all bags are read at once."""
     monkeypatch.setattr("ros2_memory.columns.plan.MAX_COLUMNS", 3)
-    driven = [odom(START_S * NS_PER_S + n * NS_PER_S // 2, n / 2, 0.0) for n in range(80)]
+    driven = along_x(START_S * NS_PER_S, 40, mps=1.0, hz=2)
     torn = 20 * spoiled + 7
     driven[torn] = replace(driven[torn], body=driven[torn].payload[:40])
     for nth in range(4):
@@ -244,7 +244,7 @@ def test_bags_beside_one_whose_poses_have_no_position_are_shipped(
 ) -> None:
     """The robot's places are known, too, where that one lies in no part of theirs."""
     begin = START_S * NS_PER_S
-    driven = [odom(begin + n * NS_PER_S // 5, n / 10, 0.0) for n in range(50)]
+    driven = along_x(begin, 10, mps=0.5, hz=5)
     said = [text(begin + (n - earlier_s) * NS_PER_S + 7, "x", "/odom") for n in range(10)]
     write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", driven)
     write_mcap(tmp_path / "bags" / "other" / "other_0.mcap", said)

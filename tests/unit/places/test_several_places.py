@@ -23,7 +23,17 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import boolean, octets, odom, text, tf, transform, write_mcap, write_splits
+from tests.support.bags import (
+    along_x,
+    boolean,
+    octets,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+    write_splits,
+)
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
@@ -182,7 +192,7 @@ def test_a_condition_that_always_held_leaves_out_no_metre_of_sparse_poses(tmp_pa
 def test_a_while_of_a_topic_that_fell_silent_says_for_how_long_it_is_not_known(
     tmp_path: Path, name: str, given: dict[str, Any]
 ) -> None:
-    poses = [odom(T0 + nth * S, nth / 10, 0.0) for nth in range(101)]
+    poses = along_x(T0, 101, mps=0.1)
     flags = [boolean(T0 + nth * S, True) for nth in range(41)]
     memory = remembered(tmp_path, sorted([*poses, *flags], key=attrgetter("log_time")))
     span = {"start": T0 // S, "end": T0 // S + 100}

@@ -11,14 +11,14 @@ from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import McapLayout, along_x, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import files_in
 from tests.unit.storage.mcap.test_writer import contents
 
 S = 10**9
 T0 = 1_790_000_000 * S
-MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(200)]
+MESSAGES = along_x(T0, 10, mps=1.0, hz=20)
 
 
 REPAIRER = Repairer(McapReader(), McapWriter())

@@ -38,7 +38,7 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
+from tests.support.bags import along_x, boolean, detections, odom, write_mcap, write_splits
 from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.analysis.motion.posed import off_line
@@ -326,7 +326,7 @@ def test_every_message_is_counted_when_it_was_also_where_bags_have_many(
 ) -> None:
     """Ten minutes at 10 Hz, of which the middle 100 s are looked at."""
     monkeypatch.setattr("ros2_memory.serving.page.topics._MOST_TIMES", most_times)
-    write_splits(tmp_path, [odom(BEGIN + n * S // 10, 0.0, 0.0) for n in range(6000)], split_s)
+    write_splits(tmp_path, along_x(BEGIN, 600, hz=10), split_s)
     query = f"start={BEGIN_S + 250}&end={BEGIN_S + 350}"
     [row] = topics(memory_of(tmp_path), query)["topics"]
     assert sum(row["spoke"]) == pytest.approx(1000, abs=1)
