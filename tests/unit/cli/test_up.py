@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from ros2_memory.cli.proposal import Offered
+from ros2_memory.cli.up import Survey
 from ros2_memory.recorder.process.topics import load_topics
 from tests.support import stub_ros2
 from tests.support.memories import ROOT
@@ -23,6 +25,13 @@ def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ros2_memory.cli.up.SECONDS", 0.3)
     monkeypatch.setattr("ros2_memory.cli.up.QUIET_S", 0.1)
+
+
+@pytest.fixture
+def surveyed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the robot offers is known: two recordings take a second."""
+    topic = Offered("/odom", "nav_msgs/msg/Odometry", messages=9, hz=9.0, payload_bytes=700.0)
+    monkeypatch.setattr("ros2_memory.cli.up.survey_topics", lambda *_: Survey([topic], 0.5, 4000))
 
 
 def test_a_deployment_that_does_not_record_is_refused(exits: Program, tmp_path: Path) -> None:
@@ -59,6 +68,7 @@ def test_a_recorder_that_fails_is_named_with_its_last_words(
     assert "`ros2-memory doctor` checks the installation" in said
 
 
+@pytest.mark.usefixtures("surveyed")
 def test_who_answers_no_has_nothing_written(
     exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,7 +98,7 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.usefixtures("became")
+@pytest.mark.usefixtures("became", "surveyed")
 @pytest.mark.parametrize(
     ("typed", "flags", "before", "remembers"),
     [
@@ -115,6 +125,7 @@ def test_only_a_person_has_something_outlive_the_bags(
     assert ("memory.keep=true" in shown) is remembers
 
 
+@pytest.mark.usefixtures("surveyed")
 def test_what_is_to_outlive_the_bags_is_asked_once(
     exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
