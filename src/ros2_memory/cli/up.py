@@ -453,7 +453,7 @@ def _measure(
         # A topic is heard from its first message on: others may have been subscribed to before.
         span_s = unix_from_ns(end - min(times[topic]))
         count, total = len(payloads), sum(payloads)
-        hz = (count - 1) / span_s if count > 1 and span_s else 1 / max(span_s, 1.0)
+        hz = (count - 1) / span_s if count > 1 and span_s else 1 / max(span_s, SECONDS)
         measured[topic] = replace(
             offered[topic], messages=count, hz=hz, payload_bytes=total / count
         )

@@ -4,15 +4,25 @@ import io
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.cli.proposal import Offered
-from ros2_memory.cli.up import Survey
+from ros2_memory.cli.up import Survey, survey_topics
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
+from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import ROOT
 from tests.support.program import Program
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.process.installation import Installation
+
+T0 = 1_700_000_000 * NS_PER_S
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +76,20 @@ def test_a_recorder_that_fails_is_named_with_its_last_words(
     assert "ros2 bag record ended by itself (status 2)" in said
     assert "unrecognized arguments: --start-paused" in said
     assert "`ros2-memory doctor` checks the installation" in said
+
+
+def test_a_message_that_comes_once_as_topics_are_measured_is_no_message_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """10 kB a second would be 0.9 GB a day, for which nothing else would be proposed."""
+    messages = [odom(T0 + n * NS_PER_S // 10) for n in range(50)]
+    messages.append(text(messages[-1].log_time, "x" * 10_000, "/plan"))
+    look = write_mcap(tmp_path / "0.mcap", [], declared={(m.topic, m.type) for m in messages})
+    bags = iter([look, write_mcap(tmp_path / "1.mcap", messages)])
+    monkeypatch.setattr("ros2_memory.cli.up._record", lambda *_, **_options: next(bags))
+    monkeypatch.setattr("ros2_memory.cli.up.SECONDS", 5.0)
+    found = survey_topics(cast("Installation", None), BagDirReader(McapReader()), 1).topics
+    assert {topic.topic: round(topic.hz, 2) for topic in found} == {"/odom": 10.0, "/plan": 0.2}
 
 
 @pytest.mark.usefixtures("surveyed")
