@@ -303,10 +303,9 @@ def require_bags(view: View) -> None:
     if snapshot.bags:
         return
     if snapshot.active:
-        lack, after_s = nothing_here(snapshot), view.limits.closed_after_s
-        if _active_answers(view):
-            lack, after_s = "nothing of the first split is on disk yet", _ON_DISK_S
-        raise NoDataError(NoDataReason.NOT_CLOSED_YET, f"{lack}; ask again in {after_s:g} s")
+        is_read = _active_answers(view)
+        lack = "nothing of the first split is on disk yet" if is_read else nothing_here(snapshot)
+        raise NoDataError(NoDataReason.NOT_CLOSED_YET, f"{lack}; ask again {_when_read(view)}")
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
         why.append(f"{counted(len(snapshot.damaged), 'damaged file')} set aside")
@@ -623,6 +622,16 @@ def _active_answers(view: View) -> bool:
     return all(aside.answers for aside in view.snapshot.active)
 
 
+def _when_read(view: View) -> str:
+    """Returns when what is being written answers, to end a sentence."""
+    if _active_answers(view):
+        return f"in {_ON_DISK_S} s"
+    heartbeat = view.memory.heartbeat()
+    if heartbeat is None and view.limits.kept is None:
+        return "when its program has closed it (reader.include_active=true reads MCAP before that)"
+    return f"in {view.limits.closed_after_s:g} s"
+
+
 def are_unlisted(memory: Memory, topics: Sequence[str]) -> bool:
     """Returns whether a recorder runs whose list has none of the topics, or excludes these."""
     heartbeat = memory.heartbeat()
@@ -645,11 +654,8 @@ def _advice(view: View, reason: NoDataReason, at: Ns, topics: Sequence[str] = ()
             f"the recorder no longer records {listed(topics)} (recording.topics_file): ask about "
             "an earlier moment"
         )
-    elif reason is NoDataReason.NOT_CLOSED_YET and _active_answers(view):
-        yield f"ask about an earlier moment, or again in {_ON_DISK_S} s"
     elif reason is NoDataReason.NOT_CLOSED_YET:
-        yield (
-            "the split being written is not read until it closes: ask about an earlier moment, "
-            f"or again in {view.limits.closed_after_s:g} s"
-        )
+        if not _active_answers(view):
+            yield "the split being written is not read until it closes"
+        yield f"ask about an earlier moment, or again {_when_read(view)}"
     yield from _describe_future(view, at)

@@ -226,6 +226,17 @@ def test_recordings_says_whose_they_are_and_names_what_is_not_read(
     assert {row["whose"] for row in rows(exits).values()} == {None}
 
 
+def test_when_another_program_closes_its_bag_is_not_known(tmp_path: Path, exits: Program) -> None:
+    now = [text(time.time_ns(), "now")]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", now, McapLayout(finish=False))
+    why = "ask again when its program has closed it (reader.include_active=true reads MCAP before"
+    for line in ("cat /chatter", "export --mcap x.mcap"):
+        assert why in exits(2, line, tmp_path).err
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [text(time.time_ns() - 60 * NS_PER_S, "before")])
+    line = "ask get_topic_seconds_ago topic=/chatter seconds_ago=0 data.now=wall"
+    assert f"or {why[4:]}" in " ".join(exits(1, line, tmp_path).out.split())
+
+
 def test_a_recording_without_a_message_is_named_too(folder: Path, exits: Program) -> None:
     names = ["b/b_1.mcap", "caught_nothing/caught_nothing_0.mcap", "lies_loose.mcap"]
     for name in names:

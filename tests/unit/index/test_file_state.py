@@ -255,7 +255,8 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     bags.split(name, words(10, 20))
     held_back = "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
     assert nothing_here(index_of(bags).snapshot()) == held_back
-    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 3600 * S))
+    limits = QuerySettings(kept=RetentionLimits(10**9, 0))
+    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 3600 * S), limits=limits)
     reply = asked(memory, "recap", start=T0 // S, end=T0 // S + 5)
     assert (reply["reason"], reply["detail"]) == (
         "not_closed_yet",
