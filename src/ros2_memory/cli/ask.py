@@ -25,7 +25,13 @@ from ros2_memory.cli.options import (
     present_time,
     with_date,
 )
-from ros2_memory.cli.output import plain_cell, print_json, print_line, print_reply, spinner
+from ros2_memory.cli.output import (
+    print_json,
+    print_line,
+    print_reply,
+    spinner,
+    with_plain_numbers,
+)
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -114,19 +120,14 @@ def ask(
                 call = Call(Deadline.after(loaded.server.call_timeout_s))
                 memory = fleet.newest(robot, call) or memory
         reply = answer_to(dispatcher, memory, name, arguments)
-    parse_float = _plain_number if name == _QUERY_LAKE else float
-    answer: JsonValue = json.loads(reply.text, parse_float=parse_float)
+    answer: JsonValue = json.loads(reply.text)
     if as_json:
         print_line(reply.text)
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(answer)
+        print_reply(with_plain_numbers(answer, is_recorded=name == _QUERY_LAKE))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
-
-
-def _plain_number(text: str) -> JsonValue:
-    return plain_cell(float(text))
 
 
 def _print_tools(tools: Iterable[Tool], *, as_json: bool) -> None:

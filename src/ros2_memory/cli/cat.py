@@ -15,6 +15,7 @@ from ros2_memory.cli.output import (
     format_value,
     print_exactly,
     print_notes,
+    with_plain_numbers,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
@@ -78,7 +79,8 @@ def cat(
         )
     else:
         lines = (
-            f"{format_time(unix_from_ns(time))}  {format_value(value)}" for time, value in rows
+            f"{format_time(unix_from_ns(time))}  {format_value(with_plain_numbers(value))}"
+            for time, value in rows
         )
     count = print_exactly(lines)
     note_unread(view, window)

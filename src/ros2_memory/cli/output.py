@@ -169,9 +169,21 @@ def filled_leaves(value: JsonValue) -> dict[str, JsonValue]:
     return {path: inner for path, inner in leaves(value) if inner != {}}
 
 
-def plain_cell(cell: JsonValue) -> JsonValue:
-    """Returns a cell of a SELECT as it is printed: a float as text, since one may seem a time."""
-    return f"{cell:.15g}" if isinstance(cell, float) else cell
+def with_plain_numbers(value: JsonValue, *, is_recorded: bool = True) -> JsonValue:
+    """Returns a value whose recorded floats are texts, since one may seem a time.
+
+    All of a value that `is_recorded`; of a reply those below the key `value`.
+    """
+    if isinstance(value, float):
+        return f"{value:.15g}" if is_recorded else value
+    if isinstance(value, list):
+        return [with_plain_numbers(inner, is_recorded=is_recorded) for inner in value]
+    if isinstance(value, dict):
+        return {
+            key: with_plain_numbers(inner, is_recorded=is_recorded or key == "value")
+            for key, inner in value.items()
+        }
+    return value
 
 
 def format_value(value: JsonValue) -> str:

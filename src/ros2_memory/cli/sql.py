@@ -7,7 +7,7 @@ import typer
 from ros2_memory.bootstrap_fleet import open_lake
 from ros2_memory.cli.csv_line import csv_line
 from ros2_memory.cli.options import AsJson, Overrides, load_for
-from ros2_memory.cli.output import plain_cell, print_exactly, print_line, print_reply
+from ros2_memory.cli.output import print_exactly, print_line, print_reply, with_plain_numbers
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.tools.reply_size import to_json_text
 
@@ -43,9 +43,8 @@ def sql(
         return
     if len(set(table.columns)) < len(table.columns):
         raise InvalidArgumentsError("two columns have one name: give one another with AS, or --csv")
-    rows = table.rows if as_json else [[*map(plain_cell, row)] for row in table.rows]
-    answer: list[JsonValue] = [dict(zip(table.columns, row, strict=True)) for row in rows]
+    answer: list[JsonValue] = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     if as_json:
         print_line(to_json_text(answer))
     else:
-        print_reply(answer)
+        print_reply(with_plain_numbers(answer))

@@ -31,7 +31,7 @@ from ros2_memory.columns import database
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, make, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
@@ -340,6 +340,19 @@ def test_brackets_of_a_path_and_of_a_question_are_shown_as_they_stand(
     assert f"looking through {bag_dir}" in terminal.getvalue()
     exits(1, "ask", bag_dir, "[/x]")
     assert "asking [/x]" in terminal.getvalue()
+
+
+def test_a_recorded_number_is_no_time_however_large(tmp_path: Path, exits: Program) -> None:
+    free = make("std_msgs/msg/Float64", data=2_147_483_648.5)
+    write_mcap(tmp_path / "a" / "a_0.mcap", [Msg("/free", "std_msgs/msg/Float64", T0, free)])
+    assert "  value: 2147483648.5\n" in exits(0, "cat /free", tmp_path).out
+    for line in (
+        f"get_topic_at_time topic=/free timestamp={T0 // NS_PER_S}",
+        "get_topic_in_last topic=/free seconds=9",
+    ):
+        printed = exits(0, "ask", *line.split(), tmp_path).out
+        assert "2147483648.5" in printed
+        assert format_time(T0 / NS_PER_S) in printed
 
 
 def test_csv_has_a_column_for_each_field(folder: Path, exits: Program) -> None:
