@@ -66,7 +66,8 @@ from ros2_memory.history.driven_path import (
     no_path,
     resolve_path_topic,
 )
-from ros2_memory.history.held_values import newest_stating, note_unnamed, still_holds
+from ros2_memory.history.held_values import newest_stating, note_unnamed
+from ros2_memory.history.lasting import still_holds
 from ros2_memory.history.no_data import (
     accepting,
     describe_earlier_poses,

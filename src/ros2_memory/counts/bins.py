@@ -38,7 +38,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import TEXT, held_times, is_latched
+from ros2_memory.history.lasting import TEXT, held_times, is_latched
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.places.pose_frames import (
     known_track,

@@ -44,15 +44,14 @@ from ros2_memory.history.coverage import (
     shown_window,
     unix_text,
 )
-from ros2_memory.history.held_values import (
-    HeldValue,
-    HeldValues,
-    frequent_times,
+from ros2_memory.history.held_values import HeldValue, HeldValues
+from ros2_memory.history.lasting import (
+    held_times,
     held_until,
     holds_on,
     is_latched,
     is_text,
-    silences_of,
+    lasting_of,
 )
 from ros2_memory.history.no_data import matching_topics, no_value_between, require_recorded
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -322,7 +321,7 @@ def _flag_spans(
 ) -> list[_HeldSpan]:
     """Returns when a boolean held, in order, by its states; see `_flag_states`."""
     last = binned.window.start if events.is_empty else events.last
-    end = held_until(binned.view, topic, last, max(last, binned.window.stop), or_rare=True)
+    end = held_until(binned.view, topic, last, max(last, binned.window.stop), states=True)
     if events.left_out and states:
         end, _ = states[-1]  # later changes are left out
     changes = [next(same) for _, same in groupby(states, itemgetter(1))]
@@ -400,15 +399,15 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
 
 
 def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Sequence[Span]:
-    """Returns the silences of a topic in some spans through which what it says does not hold."""
+    """Returns the silences of a topic in some spans through which what it says does not last."""
     long = [span for span in spans if span.stop - span.start > SILENCE_NS]
     if not long:
         return []
-    silences, frequent = silences_of(binned.view, topic), frequent_times(binned.view, topic)
-    if not frequent:
-        return silences
-    window = TimeWindow(long[0].start, long[-1].stop + 1)
-    heard = heard_times(binned.view, (topic,), window)
+    view, window = binned.view, TimeWindow(long[0].start, long[-1].stop + 1)
+    frequent = lasting_of(view, topic, states=True).frequent
+    lasts = united([*held_times(view, [topic], window), *frequent])
+    silences = without([(window.start, window.stop)], lasts)
+    heard = heard_times(view, (topic,), window) if frequent else ()
     between = (
         (last - 1, min(first, window.stop))
         for (_, last), (first, _) in pairwise(heard)
@@ -416,7 +415,7 @@ def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> S
         if lies_inside(frequent, last - 1) and window.contains(last - 1)
     )
     # A thinned day has one message of a measurement a minute.
-    return [*silences, *without(between, binned.view.timeline.thinned_times)]
+    return [*silences, *without(between, view.timeline.thinned_times)]
 
 
 def _heard_parts(span: _HeldSpan, unheard: Spans) -> list[_HeldSpan]:

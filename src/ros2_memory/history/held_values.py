@@ -1,69 +1,42 @@
 """The values that a topic held, and until when: a value holds until a message says another one.
 
-A value of a rare topic, or a text that says what a robot does (`std_msgs/msg/String`), does not end
-because the topic is silent, or because nothing was recorded for a while. A value ends, as far as is
-known:
-
-- where another run of the recorder begins, unless the topic is latched;
-- after its last message, if the topic is usually frequent and falls silent for `SILENCE_NS`, or
-  if it is rare, has no texts and falls silent for longer than usual (`Snapshot.silences`);
-- where messages of the topic were deleted;
-- where a message cannot be decoded, which may say another one.
+Before that it ends as any state does (see `Lasting`), and where a message cannot be decoded, which
+may say another one.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_left, bisect_right, insort
+from bisect import insort
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import at_field
-from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.columns.shown import words_of
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
-from ros2_memory.core.memo import Key
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.spans import Spans, lies_inside, united, without
 from ros2_memory.core.text import listed, repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S, UNDECODED, Note
-from ros2_memory.history.coverage import cut_spans, deleted_by_gap
-from ros2_memory.history.scan import blocks, of_columns, open_scan, scan
+from ros2_memory.history.lasting import TEXT, Lasting
+from ros2_memory.history.scan import blocks, of_columns, scan
 from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.bag_access import StoredMessage
-    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Pace
     from ros2_memory.storage.base import IntArray
 
-TEXT: Final = "std_msgs/msg/String"
 NUMBERS: Final = ("std_msgs/msg/Int", "std_msgs/msg/UInt", "std_msgs/msg/Float")
 """How the types of messages that are one number, or an array of such, begin."""
-_DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
-"""Of a view: by topic, its `deletions`."""
-_FREQUENT: Final[Key[dict[str, Spans]]] = Key()
-"""Of a timeline: by topic, the `frequent_times` of one that is not latched."""
-_SILENCES: Final[Key[dict[str, Ns]]] = Key()
-"""Of a timeline: by topic, its `silence_of`."""
-_PACED: Final = 20
-"""A topic is regular or not only if it has so many messages."""
-_MOST_PACED: Final = 1000
-"""The newest messages of a topic that say whether it is regular."""
-_REGULAR: Final = 1.05
-"""A topic is regular if one pause in twenty is at most so many times as long as one in four."""
 _MOST_TRIED: Final = 200
 """At most this many messages are read to find one that says something of the field."""
 _MOST_CHARS: Final = 16 << 20
@@ -147,9 +120,7 @@ class HeldValues:
         self._view = view
         self._topic = topic
         self._field = field
-        holds_on_always = is_text(view, topic)
-        self._frequent = [] if holds_on_always else frequent_times(view, topic)
-        self._breaks = (breaks_of if holds_on_always else ends_of_holding)(view, topic)
+        self._lasting = Lasting(view, [topic], texts=True)
         self._undecoded: dict[Ns, Note] = {}  # by log time, which is one of the breaks
         self._reading = view.call.partial_after(READING_S)
         self.complete_since: Ns = MAX_NS
@@ -230,7 +201,9 @@ class HeldValues:
             if following is not None and self._goes_on(run, following):
                 # Only the newest run can go on after `until`.
                 run, following = run._replace(last=following.last), next(later, None)
-            stop, ended = self._end_of(run, following)
+            stop, ended = self._lasting.until(
+                run.last, MAX_NS if following is None else following.first
+            )
             if not ended and stop in self._undecoded:
                 self._view.notes.add_lack(self._undecoded[stop])
             self.complete_since = run.first
@@ -312,10 +285,7 @@ class HeldValues:
         order = np.argsort(times, kind="stable")
         texts = joined_texts([part_texts for _, part_texts in parts])[order]
         times, codes = times[order], texts.codes
-        breaks = np.diff(codes) != 0
-        breaks |= np.diff(np.searchsorted(self._breaks, times)) > 0
-        for nth in np.flatnonzero(np.diff(times) > SILENCE_NS).tolist() if self._frequent else ():
-            breaks[nth] |= lies_inside(self._frequent, int(times[nth]))
+        breaks = (np.diff(codes) != 0) | self._lasting.ends(times)
         firsts = np.append(0, np.flatnonzero(breaks) + 1)
         lasts = np.append(firsts[1:], times.size) - 1
         return [
@@ -372,7 +342,7 @@ class HeldValues:
         """Ends what held before a message that cannot be decoded."""
         at = stored.time
         if at not in self._undecoded:
-            insort(self._breaks, at)
+            insort(self._lasting.breaks, at)
             self._undecoded[at] = Note(UNDECODED, stored.topic, why, at, at)
 
     def _value_of(self, message: object, type_name: str) -> JsonValue:
@@ -398,66 +368,7 @@ class HeldValues:
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         """Whether a run goes on in the next one, with nothing in between that ends it."""
-        return older.word == newer.word and self._end_of(older, newer) == (newer.first, True)
-
-    def _end_of(self, run: _Run, following: _Run | None) -> tuple[Ns, bool]:
-        """Returns until when a run is known to hold, and whether the following run ends it."""
-        next_first = MAX_NS if following is None else following.first
-        if next_first - run.last > SILENCE_NS and lies_inside(self._frequent, run.last):
-            return run.last, False
-        nth = bisect_left(self._breaks, run.last)
-        if nth < len(self._breaks) and self._breaks[nth] < next_first:
-            return self._breaks[nth], False
-        if following is None:
-            return max(run.last, self._view.snapshot.latest or run.last), False
-        return next_first, True
-
-
-def breaks_of(view: View, topic: str) -> list[Ns]:
-    """Returns the moments, in order, after which an earlier value is not known to hold.
-
-    Messages were deleted then, another run of the recorder began, or the clock was wrong: misdated
-    bags before the memory end, or those after it begin.
-    """
-    snapshot = view.snapshot
-    breaks = {*deletions(view, topic)}
-    if not is_latched(view, topic):
-        breaks.update(start for start, _ in snapshot.breaks)
-    earliest, latest = snapshot.earliest, snapshot.latest
-    if earliest is not None and latest is not None:
-        spans = [fault.span for fault in snapshot.misdated]
-        ends_before = [end for _, end in spans if end < earliest]
-        if ends_before:
-            breaks.add(max(ends_before))
-        if any(start > latest for start, _ in spans):
-            breaks.add(latest)
-    return sorted(breaks)
-
-
-def deletions(view: View, topic: str) -> Sequence[Ns]:
-    """Returns the moments after which messages of a topic may have been deleted, up to its next.
-
-    When retention deletes bags as a whole, it carries on the newest value of a latched topic, and
-    the values that held while something was recorded that stays. So after the last carried message
-    of a deleted time nothing is missing, and if the topic has none there, nothing was deleted.
-    """
-    known = view.memo.of(_DELETIONS, dict)
-    if topic not in known:
-        cut = cut_spans(view.bag_dir, topic, TimeWindow.everything())
-        moments = [start for start, _ in cut]
-        statics = view.limits.latching.static_topics
-        is_carried_on = view.timeline.is_transient_state(topic) or topic in statics
-        for gap_end, deleted in deleted_by_gap(view, TimeWindow(0, MAX_NS)):
-            begin, _ = deleted[0]
-            if not is_carried_on:
-                moments.append(begin)
-                continue
-            scanned = scan(view, topic, TimeWindow(begin, gap_end + 1), columns=False)
-            times = [*chain.from_iterable(rows.times.tolist() for rows in scanned)]
-            newest = max(times, default=MIN_NS)
-            moments += [at for at in (begin, *times) if at < newest]
-        known[topic] = moments
-    return known[topic]
+        return older.word == newer.word and self._lasting.until(older.last, newer.first)[1]
 
 
 def _canonical(value: JsonValue) -> JsonValue:
@@ -470,16 +381,6 @@ def _canonical(value: JsonValue) -> JsonValue:
     if not isinstance(value, float) or not math.isfinite(value):
         return value
     return int(value) if value.is_integer() else round_real(value)
-
-
-def is_latched(view: View, topic: str) -> bool:
-    """Returns whether a topic is latched: its last message holds."""
-    return view.limits.latching.is_latched(view.snapshot, topic)
-
-
-def is_text(view: View, topic: str) -> bool:
-    """Returns whether all messages of a topic are plain texts."""
-    return set(view.timeline.types_of(topic)) == {TEXT}
 
 
 def newest_stating(
@@ -552,149 +453,3 @@ def names_without(view: View, topic: str, field: str, until: Ns) -> list[str]:
             return []
         names.update(dict.fromkeys(map(str, names_beside(value, path))))
     return sorted(names)
-
-
-def held_until(view: View, topic: str, last: Ns, end: Ns, *, or_rare: bool = False) -> Ns:
-    """Returns until when the message of a topic at `last` held (log time, ns), at most `end`.
-
-    On a latched topic, and with `or_rare` on a rare one, it holds until the next message, or as far
-    as something is recorded. On another topic it holds until the next message if that comes within
-    `silence_of`, else it does not hold after `last`.
-    """
-    if is_latched(view, topic) or (or_rare and holds_on(view, topic, last)):
-        ends = [end, view.snapshot.latest or end]
-        ends += [moment for moment in ends_of_holding(view, topic) if moment >= last]
-        following = view.stream.first([topic], TimeWindow(last + 1, end + 1))
-        if following is not None:
-            ends.append(following.time)
-        return max(last, min(ends))
-    near = TimeWindow(last + 1, last + silence_of(view, topic) + 1)
-    following = view.stream.first([topic], near)
-    return last if following is None else max(last, min(following.time, end))
-
-
-def held_at(view: View, topic: str, moment: Ns, *, or_rare: bool = False) -> StoredMessage | None:
-    """Returns the message of a latched topic, with `or_rare` of a rare one, that held at a moment.
-
-    None on other topics.
-    """
-    if not or_rare and not is_latched(view, topic):
-        return None
-    before = view.stream.last(topic, moment)
-    if before is None or not holds_on(view, topic, before.time):
-        return None
-    is_over = any(before.time <= at < moment for at in ends_of_holding(view, topic))
-    return None if is_over else before
-
-
-def still_holds(view: View, stored: StoredMessage, moment: Ns) -> bool:
-    """Returns whether the newest message before a moment is latched and holds then.
-
-    In a time that was excluded, nothing is known to hold.
-    """
-    return (
-        view.limits.latching.holds(view.snapshot, stored)
-        and not any(stored.time <= start < moment for start in deletions(view, stored.topic))
-        and not excluded_between(view.bag_dir, moment, moment + 1)
-    )
-
-
-def holds_on(view: View, topic: str, at: Ns) -> bool:
-    """Returns whether what a topic said at a log time holds through silence."""
-    return not lies_inside(frequent_times(view, topic), at)
-
-
-def silence_of(view: View, topic: str) -> Ns:
-    """Returns after how long a silence (ns) what a topic said is not known to hold.
-
-    That is `SILENCE_NS`, but one and a half periods of a topic that is regularly published more
-    seldom, as a battery is, or about as often: else each message of it would be a state of its own.
-    """
-    known = view.timeline.memo.of(_SILENCES, dict)
-    if topic not in known:
-        totals = [pace.topic for pace in view.timeline.paces(topic).values()]
-        lengths = sum(of_topic.last - of_topic.first for of_topic in totals)
-        is_slow = 3 * lengths >= SILENCE_NS * sum(of_topic.messages for of_topic in totals)
-        often, seldom = np.quantile(_pauses(view, topic), (0.75, 0.95)) if is_slow else (0, 0)
-        is_regular = seldom <= _REGULAR * often
-        known[topic] = max(SILENCE_NS, int(1.5 * often)) if is_regular else SILENCE_NS
-    return known[topic]
-
-
-def _pauses(view: View, topic: str) -> Ints:
-    """Returns the times (ns) between the newest messages of a topic; 0 if they are too few."""
-    parts: list[IntArray] = []
-    everything = open_scan(view, topic, TimeWindow.everything(), columns=False)
-    for rows in everything.rows(newest_first=True):
-        parts.append(rows.times)
-        if sum(map(len, parts)) > _MOST_PACED:
-            break
-    times = np.sort(np.concatenate(parts))[-_MOST_PACED:] if parts else np.empty(0, np.int64)
-    return np.diff(times) if times.size >= _PACED else np.zeros(1, np.int64)
-
-
-def longest_silence(view: View, topics: Iterable[str]) -> Ns:
-    """Returns the longest `silence_of` some topics."""
-    return max((silence_of(view, topic) for topic in topics), default=SILENCE_NS)
-
-
-def frequent_times(view: View, topic: str) -> Spans:
-    """Returns the times in which what a topic says does not hold through silence.
-
-    These are the sessions in which it is not rare; none, if it is latched. Another session decides
-    nothing: its driver may be another one, and it may be deleted.
-    """
-    known = view.timeline.memo.of(_FREQUENT, dict)
-    if topic not in known:
-        # A wrong clock spreads a recording over years: it counts if its session has no other.
-        misdated = {fault.bag.recording for fault in view.snapshot.dating.faults}
-        recordings = view.timeline.paces(topic).items()
-        paces: dict[Session, Pace] = {}
-        for recording, pace in sorted(recordings, key=lambda item: item[0] in misdated):
-            session = view.sessions.session_of(recording)
-            if session not in paces or recording not in misdated:
-                paces[session] = paces.get(session, pace) | pace
-        known[topic] = united(
-            (pace.topic.first, pace.end + 1) for pace in paces.values() if not pace.is_rare
-        )
-    return [] if is_latched(view, topic) else known[topic]
-
-
-def ends_of_holding(view: View, topic: str) -> list[Ns]:
-    """Returns the moments after which what a rare or latched topic said is not known to hold.
-
-    These are `breaks_of`, and where a topic that is not latched fell silent for longer than usual.
-    """
-    return sorted({*breaks_of(view, topic), *(start for start, _ in silences_of(view, topic))})
-
-
-def silences_of(view: View, topic: str) -> Spans:
-    """Returns when a topic with a usual rate was silent; never if it is latched."""
-    silences = () if is_latched(view, topic) else view.snapshot.silences
-    return [(silence.start, silence.end) for silence in silences if silence.topic == topic]
-
-
-def held_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:
-    """Returns when it is known what topics said while their messages hold on, up to a window's end.
-
-    That is from their first message on, but not from a break to their next message.
-    """
-    frequent = united(chain.from_iterable(frequent_times(view, topic) for topic in topics))
-    recordings = (view.timeline.recordings(topic).values() for topic in topics)
-    firsts = [first for first, _ in chain.from_iterable(recordings)]
-    if all(lies_inside(frequent, first) for first in firsts):
-        return []
-    breaks = sorted(chain.from_iterable(ends_of_holding(view, topic) for topic in topics))
-    bounds = [view.bounds(topic, window)[0] for topic in topics]
-    begins = np.append(np.sort(np.concatenate(bounds)), window.stop)
-    unknown: Spans = []
-    known_again = MIN_NS
-    for at in breaks[max(bisect_right(breaks, window.start) - 1, 0) :]:
-        if known_again <= at < window.stop:
-            # Bags that begin later need not be compared with the next one.
-            near = int(begins[np.searchsorted(begins, at, side="right")])
-            parts = TimeWindow(at + 1, near + 1), TimeWindow(near + 1, window.stop)
-            following = (view.stream.first([*topics], part) for part in parts if not part.empty)
-            known_again = next((message.time for message in following if message), MAX_NS)
-            unknown.append((at, known_again))
-    return without([(min(firsts), MAX_NS)], united([*unknown, *frequent]))

@@ -31,7 +31,7 @@ from ros2_memory.history.coverage import (
     was_removed,
     why_nothing,
 )
-from ros2_memory.history.held_values import is_text, still_holds
+from ros2_memory.history.lasting import is_text, still_holds
 from ros2_memory.index.file_state import HELD_BACK
 
 if TYPE_CHECKING:

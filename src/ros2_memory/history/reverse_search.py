@@ -28,7 +28,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.condition_hints import hint_on_constants, require_frame
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.held_values import is_text
+from ros2_memory.history.lasting import is_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.scan import decoded_rows, messages_at, scan
 

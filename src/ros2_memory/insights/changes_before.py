@@ -40,7 +40,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.conditions import newest_above
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import held_at, is_latched
+from ros2_memory.history.lasting import held_at, is_latched
 from ros2_memory.history.robots import note_times_twice
 from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.topic_events import (

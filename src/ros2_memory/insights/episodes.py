@@ -18,7 +18,8 @@ from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.condition_hints import names_of_numbers
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
-from ros2_memory.history.held_values import HeldValue, HeldValues, holds_on, is_latched, is_text
+from ros2_memory.history.held_values import HeldValue, HeldValues
+from ros2_memory.history.lasting import holds_on, is_latched, is_text
 from ros2_memory.history.no_data import no_value_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
@@ -40,6 +41,9 @@ _LONGEST_STATE: Final = 10_000
 """A longer text (characters) does not say what a robot does."""
 _CONSTANT: Final = re.compile(r"(?=.*[A-Z])[A-Z0-9_.:/ -]+")
 _NAME: Final = re.compile(r"[^\W\d][\w.:/-]*")
+_IDENTIFIER: Final = re.compile(r"\d{3}")
+_AGAIN: Final = 3
+"""Identifiers that come so many times on average are states, as rooms that a robot enters are."""
 _LONGEST_TEXT: Final = 200
 MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
@@ -96,11 +100,12 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
 def _name_states(texts: Sequence[str]) -> bool:
     """Returns whether texts name states: constants such as IDLE, or a few words that come again.
 
-    What people say seldom does.
+    What people say seldom does, nor do identifiers that are read now and then (PAL-004711).
     """
-    if all(map(_CONSTANT.fullmatch, texts)):
-        return True
     changes = [text for text, _ in groupby(texts)]
+    if all(map(_CONSTANT.fullmatch, texts)):
+        are_read = 2 * sum(map(bool, map(_IDENTIFIER.search, texts))) > len(texts)
+        return not are_read or len(changes) >= _AGAIN * len({*changes})
     return all(map(_NAME.fullmatch, texts)) and len(changes) >= 2 * len({*changes})
 
 

@@ -42,7 +42,7 @@ from ros2_memory.history.coverage import (
     shown_span,
     unexcluded,
 )
-from ros2_memory.history.held_values import breaks_of, deletions, is_latched
+from ros2_memory.history.lasting import breaks_of, deletions, is_latched
 from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (

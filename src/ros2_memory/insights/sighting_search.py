@@ -12,17 +12,20 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import Equals
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.history.held_values import breaks_of, held_until, is_latched, silence_of
+from ros2_memory.history.lasting import Lasting, held_until, is_latched, lasting_of
 from ros2_memory.history.reverse_search import MET, NOT_MET, Block, ReverseSearch, Tested
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.core.arrays import Flags, Ints
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 
@@ -37,8 +40,8 @@ class Run(NamedTuple):
     Attributes:
         first, last: log times (ns) of the first and the last match.
         messages: how many matches.
-        until: log time of the next message, which is no match or follows a silence (on a latched
-            topic one of `breaks_of`); `MAX_NS` if that is unknown.
+        until: log time of the next message, which is no match, or until which the last match does
+            not last; `MAX_NS` if that is unknown.
         later: how many matches after the last one have the same log time.
         begun: 1 if it is known what came before the first match, else 0.
         node: the number of the node that publishes diagnostics; else 0.
@@ -91,19 +94,14 @@ class _NodeRuns:
         topic: its number.
         node: its number.
         apart: whether each match is a run of its own.
-        breaks: of a latched topic: the moments, in order, through which no value holds. On another
-            topic (None) none holds through a silence.
-        silence: how long (ns) a pause is a silence.
+        lasting: says which match lasts until the next message.
     """
 
-    def __init__(
-        self, topic: int, node: int, *, apart: bool, breaks: Ints | None, silence: Ns
-    ) -> None:
+    def __init__(self, topic: int, node: int, *, apart: bool, lasting: Lasting) -> None:
         self._topic = topic
         self._node = node
         self._apart = apart
-        self._breaks = breaks
-        self._silence = silence
+        self._lasting = lasting
         self._tables: list[Ints] = []
         # Whether the oldest run may go on in an older message.
         self.is_open = False
@@ -123,13 +121,14 @@ class _NodeRuns:
         """Joins the matches of the next older messages to the runs."""
         after, self._begins = self._begins, int(tested.times[0])
         times, met = tested.times, tested.met
-        is_silent = self._end_before(np.append(times, after))
-        goes_on = self.is_open and not is_silent[-1]
-        bounds, rows = np.flatnonzero((met == NOT_MET) | is_silent[:-1]), np.flatnonzero(met == MET)
+        ends = self._lasting.ends(np.append(times, after))
+        goes_on = self.is_open and not ends[-1]
+        is_bound = (met == NOT_MET) | np.append(False, ends[:-1])
+        bounds, rows = np.flatnonzero(is_bound), np.flatnonzero(met == MET)
         if not rows.size and not bounds.size:
             self.is_open = goes_on
             return
-        # Bounds are messages that do not match, and silences: no run goes on across one.
+        # Bounds are messages that do not match, or until which none lasts.
         next_bound = np.searchsorted(bounds, rows, side="right")
         starts = np.flatnonzero(self._apart | (np.diff(next_bound, prepend=-1) > 0))
         stops = np.append(starts, rows.size)[1:]
@@ -148,13 +147,6 @@ class _NodeRuns:
             self._tables.append(runs)
         self.is_open = not self._apart and next_bound[:1].tolist() == [0]
 
-    def _end_before(self, times: Ints) -> Flags:
-        """Returns for each log time whether no run goes on to it from the one before."""
-        if self._breaks is None:
-            return np.diff(times, prepend=times[0]) > self._silence
-        broken = np.searchsorted(self._breaks, times)
-        return np.diff(broken, prepend=broken[0]) > 0
-
     def end(self) -> None:
         """Ends the oldest run; it is not known what follows an older one."""
         self.is_open, self._begins = False, MAX_NS
@@ -167,19 +159,16 @@ class _TopicRuns:
 
     Args:
         topic: its number.
-        apart, breaks, silence: see `_NodeRuns`.
+        apart, lasting: see `_NodeRuns`.
     """
 
-    def __init__(
-        self, topic: int, *, apart: bool, breaks: Sequence[Ns] | None, silence: Ns
-    ) -> None:
-        times = None if breaks is None else np.array(breaks, np.int64)
-        self._new_runs = partial(_NodeRuns, topic, apart=apart, breaks=times, silence=silence)
-        self._silence = silence
+    def __init__(self, topic: int, *, apart: bool, lasting: Lasting) -> None:
+        self._new_runs = partial(_NodeRuns, topic, apart=apart, lasting=lasting)
+        self._lasting = lasting
         self._by_node: dict[int, _NodeRuns] = {}
         self._waiting: list[Tested] = []
         self._messages = 0
-        # Blocks without a match that follow the next older one before a silence, the newest first.
+        # Blocks without a match that follow the next older one soon, the newest first.
         self._skipped: list[Block] = []
 
     def tables(self, *, cut: bool) -> list[Ints]:
@@ -189,8 +178,10 @@ class _TopicRuns:
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
-        # What follows this block before a silence ends the runs in it.
-        near = [newer for newer in self._skipped if newer.first - block.last <= self._silence]
+        # What follows this block soon ends the runs in it; later messages are looked up one by one.
+        pause = self._lasting.pause(block.last)
+        soon = block.last + (SILENCE_NS if pause == MAX_NS else pause)
+        near = [newer for newer in self._skipped if newer.first <= soon]
         self._skipped = [*near, block]
         if not block.has_match and not self._is_open():
             return
@@ -228,6 +219,12 @@ class _TopicRuns:
                 runs.end()
 
 
+def is_flag(condition: Condition) -> bool:
+    """Returns whether a condition asks for true or false, which is a state."""
+    test = condition.test
+    return isinstance(test, Equals) and str(test.value).casefold() in {"true", "false"}
+
+
 def find_runs(
     view: View, search: ReverseSearch, scope: Scope, *, enough: int | None
 ) -> SearchedRuns:
@@ -250,16 +247,14 @@ def find_runs(
     # Messages outside of a scope are not read, and may well be decodable.
     search.ruled_out = scope.is_bounded
     topics, is_log = search.topics, view.timeline.is_log
-    breaks = {topic: breaks_of(view, topic) for topic in topics if is_latched(view, topic)}
-    latched = [topic for topic in breaks if scope.is_bounded]
+    latched = [topic for topic in topics if scope.is_bounded and is_latched(view, topic)]
     if latched:
         enough = None
     by_topic = {
         topic: _TopicRuns(
             nth,
             apart=is_log(topic),
-            breaks=breaks.get(topic),
-            silence=silence_of(view, topic),
+            lasting=lasting_of(view, topic, states=is_flag(search.condition)),
         )
         for nth, topic in enumerate(topics)
     }

@@ -13,12 +13,13 @@ import json
 import math
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Condition, Equals, NearPosition, matched_texts
+from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
 from ros2_memory.analysis.facts import LOG
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import FLICKER_NS
@@ -38,15 +39,14 @@ from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import seen_at
-from ros2_memory.history.held_values import (
-    NUMBERS,
+from ros2_memory.history.held_values import NUMBERS, note_unnamed
+from ros2_memory.history.lasting import (
     held_at,
     held_until,
     holds_on,
     is_latched,
     is_text,
-    note_unnamed,
-    silence_of,
+    lasting_of,
 )
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch
@@ -60,7 +60,7 @@ from ros2_memory.insights.episodes import (
     says_episodes,
     with_robot,
 )
-from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs
+from ros2_memory.insights.sighting_search import Run, SearchedRuns, find_runs, is_flag
 from ros2_memory.insights.silences import describe_unsearched
 from ros2_memory.insights.topic_events import GoalRun, goals_matching
 from ros2_memory.messages.detections import Detection, detections_of
@@ -390,7 +390,7 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     oldest: dict[tuple[str, int], tuple[int, Run]] = {}
     try:
         for known, run in zip(states.tolist(), searched_runs.runs(states), strict=True):
-            lasts[known] = _lasted_until(view, run, scope)
+            lasts[known] = _lasted_until(view, search.condition, run, scope)
             oldest[run.topic, run.node] = known, run
     except QueryTimeoutError:
         # The runs of several topics overlap: since when all are known cannot be said.
@@ -403,21 +403,24 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     for row, run in () if scope.is_bounded else oldest.values():
         are_begun[row] = not _matched_before(view, search, run)
     start, end = scope.window.asked()
+    lasts_from = partial(held_until, view, last=start, end=end, states=is_flag(search.condition))
     earlier = [
         (first, last, False)
         for topic in topics
         if met_before(view, topic, search.condition, start)
-        for first, last in scope.parts_of(start, held_until(view, topic, start, end))
+        for first, last in scope.parts_of(start, lasts_from(topic=topic))
     ]
     return SightingSpans(np.concatenate((spans, held_spans(earlier))))
 
 
 def _matched_before(view: View, search: ReverseSearch, run: Run) -> bool:
     """Returns whether a run of matches goes on from a match before what was searched."""
-    if is_latched(view, run.topic):
-        held = held_at(view, run.topic, run.first)
+    states = is_flag(search.condition)
+    longest = lasting_of(view, run.topic, states=states).pause(run.first)
+    if longest == MAX_NS:
+        held = held_at(view, run.topic, run.first, states=states)
         return held is not None and bool(search.matches(held))
-    near = TimeWindow(max(run.first - silence_of(view, run.topic), MIN_NS), run.first)
+    near = TimeWindow(max(run.first - longest, MIN_NS), run.first)
     for block in search.blocks(run.topic, near):
         tested = block.tested()
         met = tested.met[(tested.nodes == run.node) & (tested.met != UNKNOWN)]
@@ -438,11 +441,9 @@ def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
     return np.array([*spans], np.int64).reshape(-1, 3)
 
 
-def met_before(
-    view: View, topic: str, condition: Condition, moment: Ns, *, or_rare: bool = False
-) -> StoredMessage | None:
+def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
     """Returns the message that held at a moment, as `held_at` does, if it meets a condition."""
-    held = held_at(view, topic, moment, or_rare=or_rare)
+    held = held_at(view, topic, moment, states=is_flag(condition))
     if held is None:
         return None
     for_type = condition.of_type(held.type, view.extractor)
@@ -505,9 +506,8 @@ def _notes_on_begin(view: View, search: ReverseSearch, window: TimeWindow) -> It
     That is a latched topic, or a rare one with a flag.
     """
     start, _ = window.asked()
-    is_flag = _is_flag(search.condition)
     for topic in search.topics:
-        before = met_before(view, topic, search.condition, start, or_rare=is_flag)
+        before = met_before(view, topic, search.condition, start)
         if before is not None:
             yield (
                 f"{topic} met this already when the window began: what it said at "
@@ -524,28 +524,23 @@ def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage 
     return next(islice(filter(search.matches, at_once), run.later, None), None)
 
 
-def _lasted_until(view: View, run: Run, scope: Scope, *, is_flag: bool = False) -> Ns:
-    """Returns until when (ns) a state lasted: until a message says otherwise, or the window ends.
+def _lasted_until(view: View, condition: Condition, run: Run, scope: Scope) -> Ns:
+    """Returns until when (ns) a match lasted: until a message says otherwise, or the window ends.
 
-    A state lasts until its last match if a silence follows, and so does a log entry. A state of a
-    latched topic, and a flag of a rare one, lasts through silences. No state lasts beyond the
-    scope.
+    A log entry does not last, and nothing does beyond the scope.
     """
-    last, silence = run.last, silence_of(view, run.topic)
+    last, states, (_, end) = run.last, is_flag(condition), scope.window.asked()
     if view.timeline.is_log(run.topic):
         return last
-    _, end = scope.window.asked()
-    may_hold = is_latched(view, run.topic) or (is_flag and holds_on(view, run.topic, last))
-    until = run.until
-    if may_hold or (until == MAX_NS and scope.is_bounded):
-        until = held_until(view, run.topic, last, end, or_rare=is_flag)
-    elif until == MAX_NS:
-        # What follows in the window, if anything, is of other nodes of diagnostics.
-        beyond = TimeWindow(max(last + 1, scope.window.stop), last + silence + 1)
-        following = None if beyond.empty else view.stream.first([run.topic], beyond)
-        until = last if following is None else following.time
-    is_silent = until - last > silence and not may_hold
-    return scope.holds_until(last, last if is_silent else max(last, min(until, end)))
+    lasting = lasting_of(view, run.topic, states=states)
+    if run.until < MAX_NS:
+        until, _ = lasting.until(last, run.until)
+    else:
+        # In an unbounded window, what follows soon in it is of other nodes of diagnostics.
+        is_known = not scope.is_bounded and lasting.pause(last) < MAX_NS
+        since = scope.window.stop if is_known else last
+        until = held_until(view, run.topic, last, end, states=states, since=since)
+    return scope.holds_until(last, max(last, min(until, end)))
 
 
 def _is_ended(view: View, run: Run, until: Ns) -> bool:
@@ -593,7 +588,7 @@ def _sighting(
         texts = tuple(str(text) for path, text in leaves(value) if path in {"name", "msg"})
     until, ended = run.last, True
     if thing is None:
-        until = _lasted_until(view, run, scope, is_flag=_is_flag(condition))
+        until = _lasted_until(view, condition, run, scope)
         ended = _is_ended(view, run, until)
     return Sighting(
         topic=run.topic,
@@ -611,12 +606,6 @@ def _sighting(
         robot_at_first=robot_at_first,
         ended=ended,
     )
-
-
-def _is_flag(condition: Condition) -> bool:
-    """Returns whether a condition asks for true or false, which holds until a message toggles."""
-    test = condition.test
-    return isinstance(test, Equals) and str(test.value).casefold() in {"true", "false"}
 
 
 def _counted_content(

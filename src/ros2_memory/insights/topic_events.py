@@ -35,7 +35,7 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted, listed
 from ros2_memory.history.context import Note
-from ros2_memory.history.held_values import breaks_of, held_at, is_latched
+from ros2_memory.history.lasting import breaks_of, held_at, is_latched
 from ros2_memory.history.scan import (
     blocks,
     joined_back,

@@ -7,7 +7,7 @@ takes the times in which the newest messages of other topics meet conditions.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -32,13 +32,7 @@ from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import recording_gaps, span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.held_values import (
-    deletions,
-    ends_of_holding,
-    frequent_times,
-    held_times,
-    longest_silence,
-)
+from ros2_memory.history.lasting import Lasting, held_times
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested, met_by_any
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -478,22 +472,14 @@ class _ConditionStates:
         if types_matching(view, topic) == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
-        topics = self.search.topics
-        self._silence = longest_silence(view, topics)
-        self._frequent = united(
-            chain.from_iterable(frequent_times(view, topic) for topic in topics)
-        )
-        # After these log times it is not known what the topics say, until their next message.
-        ends = chain.from_iterable(ends_of_holding(view, topic) for topic in topics)
-        deleted = chain.from_iterable(deletions(view, topic) for topic in topics)
-        self._breaks = sorted(
-            {*deleted, *(at for at in ends if not lies_inside(self._frequent, at))}
-        )
+        self._lasting = Lasting(view, self.search.topics)
         # The window that was read, the log times of its messages, and whether each met the
         # condition.
         self._read = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._met: list[bool] = []
+        # The log time of the first message after the window, if it comes soon.
+        self._after: Ns = MAX_NS
         self._wanted_to: Ns = MIN_NS
 
     def known_in(self, window: TimeWindow) -> Spans:
@@ -501,8 +487,8 @@ class _ConditionStates:
 
         What latched and rare topics said holds through silences; what others said does not.
         """
-        topics, around = self.search.topics, window.widened(self._silence)
-        is_frequent = overlaps_any(self._frequent, around.start, around.stop)
+        topics, around = self.search.topics, window.widened(SILENCE_NS)
+        is_frequent = overlaps_any(self._lasting.frequent, around.start, around.stop)
         heard = heard_times(self._view, topics, around) if is_frequent else []
         return united([*held_times(self._view, topics, window), *heard])
 
@@ -516,28 +502,22 @@ class _ConditionStates:
         count = bisect_right(self._times, time)
         if not count or not self._met[count - 1]:
             return False
-        last = self._times[count - 1]
-        is_silent = time - last > self._silence and lies_inside(self._frequent, last)
-        return not is_silent and self._break_after(last) >= time
+        last, reached = self._times[count - 1], time
+        if last < time and self._lasting.pause(last) < MAX_NS:
+            reached = self._times[count] if count < len(self._times) else self._after
+        stop, _ = self._lasting.until(last, reached)
+        return stop >= time
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
         """Returns until when (at most `end`) the condition is known to hold, from a log time on."""
         while time < end and self.holds_at(time):
             last = self._times[bisect_right(self._times, time) - 1]
             following = self._next_after(time, end)
-            known_until = min(following, end)
-            if known_until - last > self._silence and lies_inside(self._frequent, last):
-                return max(time, last)
-            break_time = self._break_after(last)
-            if break_time < known_until:
-                return max(time, break_time)
+            stop, is_reached = self._lasting.until(last, min(following, end))
+            if not is_reached:
+                return max(time, stop)
             time = following
         return min(time, end)
-
-    def _break_after(self, last: Ns) -> Ns:
-        """Returns the first break at or after the log time of a message; `MAX_NS` without one."""
-        nth = bisect_left(self._breaks, last)
-        return self._breaks[nth] if nth < len(self._breaks) else MAX_NS
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time in which the condition holds, in order; ends are inclusive."""
@@ -577,6 +557,9 @@ class _ConditionStates:
                 times, met = [before.time, *times], [is_met, *met]
             # None lies between the two: earlier times need no further search.
             start = MIN_NS if before is None else before.time + 1
+        soon = TimeWindow(stop, stop + SILENCE_NS)
+        after = self._view.stream.first(topics, soon) if self._lasting.frequent else None
+        self._after = MAX_NS if after is None else after.time
         self._times, self._met = times, met
         self._read = TimeWindow(start, stop)
 
@@ -598,22 +581,21 @@ class _ConditionStates:
 
 
 def heard_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:
-    """Returns when topics had messages, without the silences of `silence_of`.
+    """Returns when topics had messages, without pauses of more than `SILENCE_NS`.
 
     Only bags that hold a topic for longer are scanned. In others there is no such silence.
     """
     starts, stops = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    silence = longest_silence(view, topics)
     for topic in topics:
         firsts, lasts = view.bounds(topic, window)
-        is_long = lasts - firsts > silence
+        is_long = lasts - firsts > SILENCE_NS
         starts.append(firsts[~is_long])
         stops.append(lasts[~is_long])
         if is_long.any():
             long = spans_of(firsts[is_long], lasts[is_long] + 1)
             for rows in scan(view, topic, window, columns=False, within=united(long)):
-                piece_starts, piece_stops = pieces_of(rows.times, rows.times, silence)
+                piece_starts, piece_stops = pieces_of(rows.times, rows.times)
                 starts.append(piece_starts)
                 stops.append(piece_stops)
-    heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops), silence)
+    heard_from, heard_to = pieces_of(np.concatenate(starts), np.concatenate(stops))
     return spans_of(heard_from, heard_to + 1)

@@ -761,6 +761,8 @@ def test_an_episode_that_began_elsewhere_counts_for_its_time_in_the_place(
         (("stop", "stop", "stop"), False),
         (("Bring me the cup", "thanks", "Bring me the cup", "thanks"), False),
         (("IDLE", "12"), False),
+        (("PAL-004711", "PAL-004712", "PAL-004711"), False),
+        (("ROOM 101", "ROOM 102") * 3, True),
     ],
 )
 def test_a_state_without_an_empty_text_holds_until_the_next_one(
