@@ -31,6 +31,7 @@ well, goes last. The newest bag always stays.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import accumulate
@@ -287,10 +288,11 @@ class _Remaining:
     """
 
     def __init__(self, contents: DirContents) -> None:
-        # A file of a moment counts once, and stays when its other name is deleted.
+        # A file counts once, and stays while it has another name, as in a moment.
         self._saved = contents.saved
-        bags = sum(map(self._freed_by, contents.bags))
-        self.total = contents.other_bytes + sum(contents.saved.values()) + bags
+        files = [file for bag in contents.bags for file in bag.files]
+        self._names = Counter([*contents.saved, *(file.inode for file in files)])
+        self.total = contents.other_bytes + sum({**dict(files), **contents.saved}.values())
         self.free = contents.free_bytes
         self.deleted: set[str] = set()
 
@@ -304,7 +306,8 @@ class _Remaining:
         for bag in order:
             if self.fits(limits):
                 break
-            if bag.path not in self.deleted and self._freed_by(bag):
+            is_saved = self._saved.keys() >= {file.inode for file in bag.files}
+            if bag.path not in self.deleted and not is_saved:
                 self._delete(bag)
 
     def fits(self, limits: RetentionLimits) -> bool:
@@ -312,11 +315,9 @@ class _Remaining:
         enough = self.free is None or self.free >= limits.min_free_bytes
         return enough and self.total <= limits.max_total_bytes
 
-    def _freed_by(self, bag: StoredBag) -> int:
-        return sum(file.size for file in bag.files if file.inode not in self._saved)
-
     def _delete(self, bag: StoredBag) -> None:
-        freed = self._freed_by(bag)
+        self._names.subtract(file.inode for file in bag.files)
+        freed = sum(file.size for file in bag.files if not self._names[file.inode])
         self.total -= freed
         if self.free is not None:
             self.free += freed

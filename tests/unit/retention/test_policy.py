@@ -185,13 +185,16 @@ moments = st.one_of(
 
 @st.composite
 def stocks(draw: st.DrawFn) -> DirContents:
-    """Bags by good and bad clocks, in several recordings."""
+    """Bags by good and bad clocks, in several recordings, and some with several names."""
     bags: dict[str, StoredBag] = {}
     for number in range(draw(st.integers(0, 12))):
+        inode = draw(st.none() | st.integers(0, 2))
         made = bag(
             f"b{number}",
             draw(st.none() | moments),
-            size=draw(st.integers(1, 50)),
+            # Names of one file have its size.
+            size=draw(st.integers(1, 50)) if inode is None else 20,
+            inode=inode,
             written=draw(moments),
             recording=draw(st.sampled_from("ABC")),
             length=draw(st.sampled_from([S, 10 * S, 300 * DAY])),
@@ -239,6 +242,7 @@ def test_the_limits_are_held_by_no_more_than_is_needed_and_something_is_left(
     """In whatever order bags are known; what cannot be reached costs none."""
     plan, going = plan_deletions(held, limits), expired(held, limits)
     left = without(held, going)
+    assert plan.total_bytes == held.other_bytes + bytes_of(held.bags)
     assert fits(left, limits) == plan.fits
     assert plan.fits or len({each.files for each in left.bags}) <= 1 or plan.most_free is not None
     if plan.most_free is not None:
