@@ -105,8 +105,10 @@ class FailingFiles:
         if not isinstance(error, BagUnreachableError):
             return False
         now = self._monotonic()
-        first, last = self._failed.get(path, (now, now))
-        if now - last > _READ_BETWEEN_S:
-            first = now
+        long_ago = now - _READ_BETWEEN_S
+        # In order of their last failure: files that were read since, or are gone, are forgotten.
+        while self._failed and next(iter(self._failed.values()))[1] < long_ago:
+            del self._failed[next(iter(self._failed))]
+        first, _ = self._failed.pop(path, (now, now))
         self._failed[path] = first, now
         return now - first < RETRIED_S

@@ -76,7 +76,8 @@ class Repairer:
 
         Raises:
             BagVanishedError: the file does not exist.
-            BagError: the file cannot be repaired, and is unchanged.
+            BagError: the file cannot be repaired, and is unchanged; or it was repaired, or deleted
+                since it was empty, and its folder cannot be flushed.
         """
         try:
             with open_folder(self.root, path.absolute()) as here:

@@ -119,14 +119,14 @@ class TopicCutter:
             return self.monotonic() < until_s and free - cut.bag.size >= limits.min_free_bytes
 
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            gone_by_bag = (
-                self._cut_or_report(cut, receipts) for cut in takewhile(may_go_on, of_recording)
-            )
-            gone_of_recording = [*filter(None, gone_by_bag)]
-            # Before the next recording: a kill leaves one metadata.yaml behind its bags at most.
-            if gone_of_recording and (reason := why_not_corrected(recording, self.reader)):
-                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
-            gone += gone_of_recording
+            before = len(gone)
+            try:
+                for cut in takewhile(may_go_on, of_recording):
+                    gone += filter(None, [self._cut_or_report(cut, receipts)])
+            finally:
+                # Before the next recording: a kill leaves one metadata.yaml at most behind its bags.
+                if len(gone) > before and (reason := why_not_corrected(recording, self.reader)):
+                    _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
         if gone:
             messages = dict(sum(gone, Counter[str]()))
             ms = ms_since(begun)

@@ -57,6 +57,7 @@ def house(
     topic_ages: tuple[TopicAge, ...] = (TopicAge("/spee*", 24 * HOUR),),
     is_quiet: bool = True,
     free: int = 10**15,
+    measure: Callable[[Path], int] | None = None,
     monotonic: Callable[[], float] = lambda: 0.0,
     **how: Any,
 ) -> Housekeeping:
@@ -67,7 +68,7 @@ def house(
         McapWriter(),
         static_topics=("/tf_static",),
         is_quiet=lambda: is_quiet,
-        measure_free=lambda _: free,
+        measure_free=measure or (lambda _: free),
         monotonic=monotonic,
     )
     limits: dict[str, Any] = {"max_age_h": 168, "min_free_bytes": 1000, "keeps_foreign": True}
@@ -209,6 +210,15 @@ def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
     assert ["/speech" in counts for counts in left] == [False, True]
     house(bag_dir).apply()
     assert "/speech" not in counts_of(bag_dir / "rec_A" / "rec_A_1.mcap")
+
+
+def test_metadata_is_correct_where_the_disk_cannot_be_measured_after_a_cut(bag_dir: Path) -> None:
+    assert correct(bag_dir / "rec_A", McapReader())
+    measured = iter([lambda: 10**15])
+    house(bag_dir, measure=lambda _: next(measured, failing())()).apply()
+    left = [counts_of(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
+    assert ["/speech" in counts for counts in left] == [False, True]
+    assert not correct(bag_dir / "rec_A", McapReader())
 
 
 def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(
