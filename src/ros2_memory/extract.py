@@ -172,12 +172,14 @@ class GeodeticPosition:
     Attributes:
         latitude: where the latitude is (degrees); likewise longitude and altitude (m).
         status: where the status of the fix is; a lower one than `least` is none.
+        orientation: where the rotation from east, north and up is.
     """
 
     latitude: Route
     longitude: Route
     altitude: Route
     status: Route
+    orientation: Route
     least: int = field(default=0, kw_only=True)
 
 
@@ -224,6 +226,7 @@ UNMAPPED: Final = Plan(
                 Route(*prefix, longitude),
                 Route(*prefix, altitude),
                 Route("status", "status"),
+                Route(*prefix[:-1], "orientation"),
             )
             for prefix in ((), ("position",), ("pose", "position"))
             for latitude, longitude, altitude in (
@@ -232,7 +235,11 @@ UNMAPPED: Final = Plan(
             )
         ),
         GeodeticPosition(  # as PX4's SensorGps has them; 0 and 1 are no fix
-            *map(Route, ("latitude_deg", "longitude_deg", "altitude_msl_m", "fix_type")), least=2
+            *map(
+                Route,
+                ("latitude_deg", "longitude_deg", "altitude_msl_m", "fix_type", "orientation"),
+            ),
+            least=2,
         ),
     ),
 )
@@ -384,7 +391,8 @@ class SchemaExtractor:
                 continue
             altitude_m = math.nan if altitude is None else altitude
             has_fix = status is None or status >= place.least
-            return Geodetic(latitude, longitude, altitude_m, self.frame(message), has_fix)
+            turn = rotation(place.orientation.of(message))
+            return Geodetic(latitude, longitude, altitude_m, self.frame(message), has_fix, turn)
         return None
 
     def own_path(self, path: str, type_name: str) -> str:
@@ -551,7 +559,8 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
         return Route(*paths[name]) if name in paths else _NOWHERE
 
     twist = (route("linear_velocity"), route("angular_velocity"))
-    geodetic = GeodeticPosition(*map(route, ("latitude", "longitude", "altitude", "fix_status")))
+    of_geodetic = ("latitude", "longitude", "altitude", "fix_status", "orientation")
+    geodetic = GeodeticPosition(*map(route, of_geodetic))
     return Plan(
         fields=paths,
         poses=_poses(paths.keys(), route),

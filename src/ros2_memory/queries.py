@@ -414,7 +414,7 @@ def position(
         if geodetic is None:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))
         _note_geodetic(view, geodetic)
-        pose = Pose((math.nan,) * 3, None, geodetic.frame_id)
+        pose = Pose((math.nan,) * 3, geodetic.orientation, geodetic.frame_id)
     notes = view.notes.sentences()
     return results.Position(name, stored.time, pose, asked.age(stored), geodetic, notes=notes)
 

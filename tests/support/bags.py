@@ -53,7 +53,8 @@ OTHER_ROBOTS = {
         "uint64 timestamp\nfloat64 lat\nfloat64 lon\nfloat32 alt\n"
     ),
     "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
-    "geographic_msgs/msg/GeoPointStamped": "std_msgs/Header header\nGeoPoint position\n",
+    "geographic_msgs/msg/GeoPose": "GeoPoint position\ngeometry_msgs/Quaternion orientation\n",
+    "geographic_msgs/msg/GeoPoseStamped": "std_msgs/Header header\nGeoPose pose\n",
     "winch_msgs/msg/Winch": (
         "int8 STATE_IDLE=0\nint8 STATE_HAULING=2\nfloat32 CABLE_LONGEST=1.5\n"
         "int8 state\nfloat32 cable\nstring note\n"

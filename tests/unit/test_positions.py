@@ -258,6 +258,17 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     assert "data.pose_topic is /odom" in detail
 
 
+@each_way
+def test_a_pose_in_degrees_has_its_heading(tmp_path: Path, recalls: bool) -> None:
+    of = "geographic_msgs/msg/Geo"
+    at = make(f"{of}Point", latitude=38.7, longitude=-9.1, altitude=40.0)
+    pose = make(f"{of}Pose", position=at, orientation=quaternion(math.radians(30)))
+    body = make(f"{of}PoseStamped", header=header(T0, "earth"), pose=pose)
+    memory = remembered(tmp_path, [Msg("/geopose", f"{of}PoseStamped", T0, body)], recalls=recalls)
+    found = asked(memory, "get_position_at", timestamp=T0_S, topic="/geopose")
+    assert (found["latitude"], found["x"], found["yaw_deg"]) == (38.7, None, pytest.approx(30))
+
+
 def moved(tenths: range) -> list[Msg]:
     """The body driving at 1 m/s in the map, ten transforms a second, from 1 m on."""
     return [

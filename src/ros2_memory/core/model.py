@@ -259,7 +259,8 @@ class Pose:
 class Geodetic:
     """A position on Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN.
 
-    `has_fix` is False if the receiver reports `NavSatStatus.STATUS_NO_FIX`.
+    `has_fix` is False if the receiver reports `NavSatStatus.STATUS_NO_FIX`. `orientation` is from
+    east, north and up; None if none is beside the position.
     """
 
     latitude: float
@@ -267,6 +268,7 @@ class Geodetic:
     altitude: float
     frame_id: str = ""
     has_fix: bool = True
+    orientation: Quaternion | None = None
 
 
 @dataclass(frozen=True, slots=True)
