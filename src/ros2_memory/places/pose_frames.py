@@ -46,6 +46,7 @@ from ros2_memory.history.driven_path import (
     robot_body,
     root_above,
 )
+from ros2_memory.history.no_data import topics_of_robot
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connects,
@@ -145,17 +146,28 @@ def _topic_of_robot(view: View) -> str:
     return view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
 
 
+def unknown_path(view: View) -> Iterator[str]:
+    """Yields why nothing places the robot, if nothing does."""
+    try:
+        resolve_path_topic(view)
+    except (InvalidArgumentsError, NoDataError) as error:
+        yield f"{WHEREABOUTS} is not known: {error}"
+
+
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
     """Returns the robot's newest pose at or before a log time, with the names of its places.
 
     It is in `frame_id`, or else in the map if transforms lead there, or else in its own frame. It
-    is a pose of the recording's session, if that has poses. None if there is no recent pose.
+    is a pose of the recording's session, if that has poses. None if there is no recent pose; a note
+    names topics of poses of which one is to be chosen.
 
     Raises:
         InvalidArgumentsError: no transform leads to `frame_id` at any time.
     """
-    window = TimeWindow.before(at, NEWEST_POSE_NS)
-    stored, pose = newest_pose(view, _topic_of_robot(view), window, recording) or (None, None)
+    topic, window = _topic_of_robot(view), TimeWindow.before(at, NEWEST_POSE_NS)
+    if topic not in view.timeline.topics() and topics_of_robot(view, "position"):
+        view.notes.add(*unknown_path(view))
+    stored, pose = newest_pose(view, topic, window, recording) or (None, None)
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     in_frame = pose_if_placed(view, pose, stored.time, stored.recording, frame_id)

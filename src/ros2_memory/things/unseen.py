@@ -23,7 +23,6 @@ from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, U
 from ros2_memory.core.arrays import Columns, Flags, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    NoDataError,
     NotInLakeError,
     QueryTimeoutError,
     UndecodableError,
@@ -43,12 +42,11 @@ from ros2_memory.history.condition_hints import constants_named, position_frames
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.detections import LONGEST_LATENCY_NS, stamp_of
-from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.scan import scan
 from ros2_memory.insights.silences import describe_silences
-from ros2_memory.places.pose_frames import axes_of, map_to_choose
+from ros2_memory.places.pose_frames import axes_of, map_to_choose, unknown_path
 from ros2_memory.things.labels import last_word, plain, singular
 from ros2_memory.things.places import MAX_PLACES
 from ros2_memory.things.seen import topics_with_detections
@@ -371,17 +369,8 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
         yield from unplaced_notes(known, (question.window,))
         yield from _low_score_notes(known, question)
     yield from _notes_on_labels(known, question)
-    yield from _unknown_path_note(view, known, question.window)
-
-
-def _unknown_path_note(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
-    """Yields why nothing places the robot, if there are detections that could not be placed."""
-    if not _rows_during(window, known.estimate.unplaced, Unplaced.FIRST, Unplaced.LAST).size:
-        return
-    try:
-        resolve_path_topic(view)
-    except (InvalidArgumentsError, NoDataError) as error:
-        yield f"where the robot was is not known: {error}"
+    if _rows_during(question.window, known.estimate.unplaced, Unplaced.FIRST, Unplaced.LAST).size:
+        yield from unknown_path(view)
 
 
 def _low_score_notes(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:

@@ -107,6 +107,20 @@ def test_never_names_the_spelling_of_a_label_that_was_found(
     assert note in queries.find_last_match(memory, Call(), sought).notes
 
 
+@pytest.mark.parametrize("topics", [("/wheel_odom", "/localization/odometry"), ()])
+def test_why_no_robot_is_in_a_sighting_is_said_where_topics_have_poses(
+    tmp_path: Path, topics: tuple[str, ...]
+) -> None:
+    poses = [replace(odom(BEGIN), topic=topic) for topic in topics]
+    memory = remembered(tmp_path, [*poses, text(BEGIN + S, "lid open")])
+    given = {"topic": text(BEGIN, "").topic, "condition_type": "contains", "value": "lid"}
+    found = asked(memory, "find_matches", **given)
+    assert found["sightings"][0]["robot"] is None
+    said = [note for note in found.get("notes", ()) if "where the robot was is not known" in note]
+    assert len(said) == bool(topics)
+    assert all(topic in note for note in said for topic in topics)
+
+
 @each_way
 def test_each_text_that_an_autopilot_reports_is_one_sighting(tmp_path: Path, recalls: bool) -> None:
     """It is a line of a log: the next one, minutes later, does not end it."""
