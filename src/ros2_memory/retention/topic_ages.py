@@ -124,7 +124,7 @@ class TopicCutter:
                 for cut in takewhile(may_go_on, of_recording):
                     gone += filter(None, [self._cut_or_report(cut, receipts)])
             finally:
-                # Before the next recording: a kill leaves at most one metadata.yaml behind its bags.
+                # Before the next recording, so that a kill leaves at most one behind its bags.
                 if len(gone) > before and (reason := why_not_corrected(recording, self.reader)):
                     _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
         if gone:
