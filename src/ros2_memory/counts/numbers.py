@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.history.bag_access import StoredMessage
     from ros2_memory.results import BinColumn, Bins
     from ros2_memory.storage.base import Definition, IntArray
 
@@ -342,26 +341,25 @@ class PieceNumbers:
         self._read += len(rows)
         if self._most_read is not None and self._read > self._most_read:
             raise TooManyError
-        for bag, positions in rows.bag_rows():
-            messages = messages_of(self._view, rows.some(positions))
-            times, numbers_of_fields = self._decoded_numbers(messages)
-            if times.size:
-                table = Table(rows.table.channel, times, times, times)
-                decoded = Rows(BagUnit(bag, table, 0), lambda: None)
-                yield from self._parts_in_pieces(decoded, numbers_of_fields, since)
+        for decoded, numbers_of_fields in self._decoded_numbers(rows):
+            yield from self._parts_in_pieces(decoded, numbers_of_fields, since)
 
-    def _decoded_numbers(
-        self, messages: Iterable[StoredMessage]
-    ) -> tuple[IntArray, list[FieldNumbers]]:
-        """Returns the log times of decodable messages, and the numbers of each field in them."""
-        times: list[Ns] = []
-        samples: list[list[list[float]]] = [[] for _ in self._fields]
-        for stored, message in self._view.bags.decoded(messages, self.failures):
-            times.append(stored.time)
-            for field, field_samples in zip(self._fields, samples, strict=True):
-                value = self._view.extractor.exact_at(message, stored.type, field)
-                field_samples.append([*numbers_in(value)])
-        return np.array(times, np.int64), [*map(_numbers_of_samples, samples)]
+    def _decoded_numbers(self, rows: Rows) -> Iterator[tuple[Rows, list[FieldNumbers]]]:
+        """Yields the decodable messages of each bag, and the numbers of each field in them."""
+        for bag, positions in rows.bag_rows():
+            times: list[Ns] = []
+            samples: list[list[list[float]]] = [[] for _ in self._fields]
+            messages = messages_of(self._view, rows.some(positions))
+            for stored, message in self._view.bags.decoded(messages, self.failures):
+                times.append(stored.time)
+                for field, field_samples in zip(self._fields, samples, strict=True):
+                    value = self._view.extractor.exact_at(message, stored.type, field)
+                    field_samples.append([*numbers_in(value)])
+            if times:
+                at = np.array(times, np.int64)
+                table = Table(rows.table.channel, at, at, at)
+                decoded = Rows(BagUnit(bag, table, 0), lambda: None)
+                yield decoded, [*map(_numbers_of_samples, samples)]
 
     def _exact_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme:
         """Returns the extreme with its number and message known, from bags if columns cannot say.
@@ -403,6 +401,9 @@ class PieceNumbers:
                 field_numbers = self._numbers(decoded, field)
                 if field_numbers is not None:
                     least = min(least, _exact_least(decoded, field_numbers, sign))
+                    continue
+                for of_messages, numbers_of_fields in self._decoded_numbers(decoded):
+                    least = min(least, _exact_least(of_messages, numbers_of_fields[field], sign))
         return None if least == _NO_NUMBER else least
 
     def _least_in_columns(
