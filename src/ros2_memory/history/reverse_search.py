@@ -544,19 +544,6 @@ class ReverseSearch:
                 self._view.notes.add_lack(Note(kind, f"{topic} ({type_name})"))
 
 
-def met_by_any(met: Mask, nodes: IntArray) -> Mask:
-    """Returns for each message, in order, whether the newest one of some node meets a condition.
-
-    What a node said before its first message is taken to be what that says.
-    """
-    is_met, places = np.zeros(len(met), np.bool_), np.arange(len(met))
-    for node in np.unique(nodes).tolist():
-        rows = np.flatnonzero(nodes == node)
-        newest = np.searchsorted(rows, places, side="right") - 1
-        is_met |= met[rows[np.maximum(newest, 0)]]
-    return is_met
-
-
 def _merged_and_split(waiting: Block, following: Block) -> tuple[Block | None, Block]:
     """Returns two overlapping blocks as one after the end of `following`, and one up to its end.
 

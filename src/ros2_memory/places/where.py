@@ -11,17 +11,17 @@ from bisect import bisect_right
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import as_float
-from ros2_memory.analysis.facts import GOALS
+from ros2_memory.analysis.facts import BATTERY, DIAGNOSTICS, GOALS
 from ros2_memory.analysis.goals import while_active
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
-from ros2_memory.core.arrays import stacked
+from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, Storey, contains
@@ -33,7 +33,7 @@ from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import recording_gaps, span_text, unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.lasting import Lasting, held_times
-from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested, met_by_any
+from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch, Tested
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.places.pose_frames import (
@@ -65,6 +65,13 @@ _EXPECTED: Final = (
 )
 _REGION_KEYS: Final = frozenset({"x", "y", "z", "radius_m"})
 _MOST_PLACES: Final = 30
+_NODE_NS: Final = NS_PER_HOUR
+"""For so long at most a node of diagnostics has said something, if others have since."""
+_MOST_TRIED: Final = 200
+"""Messages that are read to find one that says whether a condition is met."""
+_NONE_TESTED: Final = Tested(
+    np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int64)
+)
 _UNNAMED: Final = "where"
 """What tables call a region without a name."""
 
@@ -459,7 +466,7 @@ def _track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
 
 
 class _ConditionStates:
-    """When the newest message of some topics met a condition.
+    """When the newest message of some topics met a condition; of diagnostics, that of any node.
 
     Messages are tested bag by bag, those around the time that is asked about, by their columns. So
     it is quick to ask about times from the newest to the oldest. Of one long time they are tested
@@ -469,18 +476,14 @@ class _ConditionStates:
     def __init__(self, view: View, during: Sought) -> None:
         self._view = view
         topic, condition = during.topic, condition_of(view, during)
-        if types_matching(view, topic) == {GOALS}:
+        types = types_matching(view, topic)
+        if types == {GOALS}:
             condition = while_active(topic, condition)
         self.search = ReverseSearch(view, topic, condition)
         self._lasting = Lasting(view, self.search.topics)
-        # The window that was read, the log times of its messages, and whether each met the
-        # condition.
-        self._read = TimeWindow(0, 0)
-        self._times: list[Ns] = []
-        self._met: list[bool] = []
-        # The log time of the first message after the window, if it comes soon.
-        self._after: Ns = MAX_NS
-        self._wanted_to: Ns = MIN_NS
+        self._look_back = _NODE_NS if types & {DIAGNOSTICS, BATTERY} else 0
+        # The window that was read, and when in it the condition was met.
+        self._read, self._met = TimeWindow(0, 0), Spans()
 
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when it is known what the topics said.
@@ -497,87 +500,100 @@ class _ConditionStates:
 
         False if there is none, or if what it said may no longer hold.
         """
-        if not self._read.contains(time):
-            self._read_around(time)
-        count = bisect_right(self._times, time)
-        if not count or not self._met[count - 1]:
-            return False
-        last, reached = self._times[count - 1], time
-        if last < time and self._lasting.pause(last) < MAX_NS:
-            reached = self._times[count] if count < len(self._times) else self._after
-        stop, _ = self._lasting.until(last, reached)
-        return stop >= time
+        start, _ = self._span_from(time, time)
+        return start <= time
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
-        """Returns until when (at most `end`) the condition is known to hold, from a log time on."""
-        while time < end and self.holds_at(time):
-            last = self._times[bisect_right(self._times, time) - 1]
-            following = self._next_after(time, end)
-            stop, is_reached = self._lasting.until(last, min(following, end))
-            if not is_reached:
-                return max(time, stop)
-            time = following
-        return min(time, end)
+        """Returns until when (at most `end`) it holds, from a log time on at which it does."""
+        stop = time + 1
+        while stop <= end:
+            start, later_stop = self._span_from(stop, end)
+            if start > stop:
+                break
+            stop = later_stop
+        return min(stop - 1, end)
 
     def parts_of(self, first: Ns, last: Ns) -> Iterator[Span]:
         """Yields the parts of a time in which the condition holds, in order; ends are inclusive."""
-        time, self._wanted_to = first, last
+        time = first
         while time <= last:
-            until = time
-            if self.holds_at(time):
-                until = self.holds_until(time, last)
-                yield time, until
-            time = MAX_NS if until == last else self._next_after(until, last)
-        self._wanted_to = MIN_NS
+            start, stop = self._span_from(time, last)
+            if start < stop and start <= last:
+                until = self.holds_until(max(start, time), last)
+                yield max(start, time), until
+                stop = until + 1
+            time = stop
 
-    def _next_after(self, time: Ns, end: Ns) -> Ns:
-        """Returns the log time of the first message after a time that was read around.
+    def _span_from(self, time: Ns, until: Ns) -> Span:
+        """Returns the first span, of those read, in which the condition holds at a time or later.
 
-        `MAX_NS` if there is none until `end`.
+        If there is none, it is empty, at the end of what was read. It is read up to `until`, but an
+        hour at most.
         """
-        count = bisect_right(self._times, time)
-        if count < len(self._times):
-            return self._times[count]
-        window = TimeWindow(self._read.stop, end + 1)
-        message = self._view.stream.first(self.search.topics, window)
-        return MAX_NS if message is None else message.time
+        if not self._read.contains(time):
+            self._read_around(time, until)
+        nth = bisect_right(self._met, time, key=itemgetter(1))
+        return self._met[nth] if nth < len(self._met) else (self._read.stop, self._read.stop)
 
-    def _read_around(self, time: Ns) -> None:
-        """Reads the bags that may hold the newest message at a log time, and ahead if wanted."""
+    def _read_around(self, time: Ns, until: Ns) -> None:
         topics = self.search.topics
-        spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
-        start = min((span.first for span in spans), default=time)
-        stop = max((span.last + 1 for span in spans), default=time + 1)
-        stop = max(stop, time + 1, min(self._wanted_to + 1, time + NS_PER_HOUR))
-        times, met = self._tested(TimeWindow(start, stop))
-        if not times or times[0] > start:
-            before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
-            is_met = None if before is None else self.search.matches(before)
-            if before is not None and is_met is not None:
-                times, met = [before.time, *times], [is_met, *met]
-            # None lies between the two: earlier times need no further search.
-            start = MIN_NS if before is None else before.time + 1
-        soon = TimeWindow(stop, stop + SILENCE_NS)
-        after = self._view.stream.first(topics, soon) if self._lasting.frequent else None
-        self._after = MAX_NS if after is None else after.time
-        self._times, self._met = times, met
+        wanted = TimeWindow(time, max(time + 1, min(until + 1, time + NS_PER_HOUR)))
+        spans = self._view.stream.overlapping_bags(topics, wanted)
+        start = min([time, *(span.first for span in spans)])
+        stop = max([wanted.stop, *(span.last + 1 for span in spans)])
+        tested = self._tested(TimeWindow(start - self._look_back, stop))
+        if not tested.times.size or tested.times[0] > start:
+            before = self._newest_before(start)
+            # Between the two nothing is said: earlier times need no further search.
+            start = MIN_NS if before is None else int(before.times[0]) + 1
+            tested = tested if before is None else stacked([before, tested])
         self._read = TimeWindow(start, stop)
+        self._met = self._spans_of(tested) if tested.times.size else []
 
-    def _tested(self, window: TimeWindow) -> tuple[list[Ns], list[bool]]:
-        """Returns the log times of the messages in a window, in order, and whether each met it."""
+    def _newest_before(self, start: Ns) -> Tested | None:
+        """Returns the newest message before a log time that says whether the condition is met."""
+        earlier = TimeWindow(MIN_NS, start)
+        messages = self._view.stream.messages(self.search.topics, earlier, newest_first=True)
+        for stored in islice(messages, _MOST_TRIED):
+            if (is_met := self.search.matches(stored)) is not None:
+                columns = (np.array([number]) for number in (stored.time, is_met, 0, 0))
+                return Tested(*columns)
+        return None
+
+    def _tested(self, window: TimeWindow) -> Tested:
+        """Returns the messages in a window, in order, that say whether the condition is met."""
         # Of messages with one log time those of the last topic are the newest.
-        parts: list[Tested] = []
+        parts = [_NONE_TESTED]
         for nth, topic in enumerate(self.search.topics):
             for block in self.search.blocks(topic, window):
                 tested = block.tested()
                 parts.append(replace(tested, sources=tested.sources + (nth << 32)))
-        if not parts:
-            return [], []
         tested = stacked(parts)
         order = np.lexsort((tested.sources, tested.times))
-        rows = order[tested.met[order] != UNKNOWN]
-        met = tested.met[rows] == MET
-        return tested.times[rows].tolist(), met_by_any(met, tested.nodes[rows]).tolist()
+        return rows_of(tested, order[tested.met[order] != UNKNOWN])
+
+    def _spans_of(self, tested: Tested) -> Spans:
+        """Returns when in what was read the condition was met, by messages in order, one at least.
+
+        What a message says holds until the next one of its node, but for `_NODE_NS` at most if
+        other nodes go on.
+        """
+        times, stop = tested.times, self._read.stop
+        by_node = stable_order(tested.nodes)
+        is_same = np.diff(tested.nodes[by_node]) == 0
+        of_node = np.full(len(times), MAX_NS)
+        of_node[by_node[:-1][is_same]] = times[by_node[1:][is_same]]
+        soon = TimeWindow(stop, max(stop, int(times[-1]) + SILENCE_NS + 1))
+        later = self._view.stream.overlapping_bags(self.search.topics, soon)
+        next_time = min((max(span.first, stop) for span in later), default=MAX_NS)
+        following = np.append(times[1:], next_time)
+        ended = self._lasting.ends(np.append(times, next_time))
+        pairs = spans_of(times[ended], following[ended])
+        ends = np.array([*(self._lasting.until(*pair)[0] for pair in pairs), MAX_NS - 1])
+        stops = np.minimum(of_node, np.maximum(times + _NODE_NS, following)).clip(max=stop)
+        stops = np.minimum(stops, ends[np.searchsorted(ends, times)] + 1)
+        is_met = (tested.met == MET) & (stops > times)
+        return spans_of(*pieces_of(times[is_met], stops[is_met], 0))
 
 
 def heard_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:

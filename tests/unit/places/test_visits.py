@@ -26,6 +26,7 @@ from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
+    diagnostics,
     odom,
     text,
     tf,
@@ -256,6 +257,30 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
             if name == "/odom":
                 visited = asked(memory, "visits", **HERE, **window)
                 assert visited.get("unknown_s", 0) == found.get("unknown_s", 0)
+
+
+@pytest.mark.parametrize("split_s", [10.0, 60.0, 10_000.0])
+def test_a_fault_of_a_node_holds_from_its_message_to_its_next_one_while_others_are_well(
+    tmp_path: Path, split_s: float
+) -> None:
+    """However bags are cut; a node that says nothing more is gone after an hour."""
+    hot = {10: (2, "hot"), 90: (0, "ok"), 200: (2, "hot")}
+    messages = [odom(BEGIN + n * S) for n in range(0, 4000, 2)]
+    messages += [diagnostics(BEGIN + n * S + 1, camera=(0, "ok")) for n in range(0, 4000, 2)]
+    messages += [diagnostics(BEGIN + n * S, motor=level) for n, level in hot.items()]
+    messages += [boolean(BEGIN + n * S, n % 20 == 0) for n in range(0, 4000, 10)]
+    write_splits(tmp_path, messages, split_s)
+    while_hot: dict[str, Any] = {
+        "while": {"topic": "/diagnostics", "condition_type": "contains", "value": "hot"}
+    }
+    for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
+        [visit] = asked(memory, "visits", **HERE, **while_hot)["visits"]
+        assert visit["duration_s"] == pytest.approx(80 + 3600)
+        window = {"start": T0, "end": T0 + 199}
+        [visit] = asked(memory, "visits", **HERE, **while_hot, **window)["visits"]
+        assert visit["duration_s"] == pytest.approx(80)
+        found = asked(memory, "find_matches", **PRESSED, **while_hot, **window, limit=100)
+        assert [row["first_seen"] - T0 for row in found["sightings"]] == [80, 60, 40, 20]
 
 
 PLACES = (
