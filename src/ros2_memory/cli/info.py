@@ -20,6 +20,7 @@ from ros2_memory.cli.output import (
 from ros2_memory.config import Settings
 from ros2_memory.core.model import BagFile
 from ros2_memory.core.reply import JsonObject, shown
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.no_data import nothing_here
@@ -44,9 +45,11 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         print_json(rows)
     elif rows:
         print_reply([{key: row[key] for key in row if key != "notes"} for row in rows])
-        # A note on a bag is on each topic in the bag.
-        topic_by_note = {note: row.topic for row in topic_rows for note in row.notes}
-        print_notes(f"{topic}: {note}" for note, topic in topic_by_note.items())
+        topics_by_note = dict[str, list[str]]()  # a note on a bag is on each topic in the bag
+        for row in topic_rows:
+            for note in row.notes:
+                topics_by_note.setdefault(note, []).append(row.topic)
+        print_notes(f"{listed(names)}: {note}" for note, names in topics_by_note.items())
     else:
         _print_nothing(memory)
     return not rows
@@ -112,8 +115,7 @@ def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
             del values[key]
     print_reply(values)
     lists = [part.get("notes") for part in report.values()]
-    notes = (str(note) for listed in lists if isinstance(listed, list) for note in listed)
-    print_notes(dict.fromkeys(notes))
+    print_notes({str(note): None for some in lists if isinstance(some, list) for note in some})
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
@@ -158,7 +160,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
         _print_nothing(memory)
     else:
         lists = {"recordings": rows, "not_read": not_read}
-        print_reply({name: [*listed] for name, listed in lists.items() if listed})
+        print_reply({name: [*some] for name, some in lists.items() if some})
     return is_empty
 
 

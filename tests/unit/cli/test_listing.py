@@ -148,6 +148,7 @@ def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
     os.utime(bag, (1.7e9, 1.7e9))
     shown = exits(0, "topics .").err
     assert shown.count("may be missing, as a crash left 1 bag open") == 1
+    assert shown.startswith("note: /chatter, /odom: messages after")
     assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
 
 
