@@ -196,6 +196,17 @@ def test_the_timeline_is_dragged_and_zoomed_and_the_address_has_the_span(page: B
     page.awaits(LOOKED)
 
 
+def test_the_wheel_moves_the_timeline_also_with_shift_by_which_a_drag_selects(
+    page: Browser,
+) -> None:
+    begun = page.run(
+        "const { span: { start }, canvas } = line, { left, top } = canvas.getBoundingClientRect();"
+        "canvas.dispatchEvent(new WheelEvent('wheel', { clientX: left + 300, clientY: top + 60,"
+        " deltaX: 40, shiftKey: true })); return start"
+    )
+    assert page.run("return [line.stretch, line.span.start > arguments[0]]", begun) == [None, True]
+
+
 def test_a_stretch_and_a_thing_show_what_was_seen(page: Browser) -> None:
     page.run("chooseStretch(state.view.events.find((each) => each.kind === 'stop'))")
     awaits_text(page, "#moment", "Stood")
@@ -418,6 +429,16 @@ RECKONED: dict[str, tuple[str, object]] = {
         .finally(() => { fetch = before; })
         """,
         "The server does not answer.",
+    ),
+    "what is unfolded stays so as new data comes, and nothing else is": (
+        """
+        const host = el('div');
+        const shown = (...numbers) => refill(host, ...numbers.map((each) =>
+        el('details', {}, el('summary', {}, `${each} more`))));
+        shown(3, 9); host.lastChild.open = true; shown(4, 10, 2);
+        return [...host.children].map((each) => each.open)
+        """,
+        [False, True, False],
     ),
     "sizes": (
         "return [0.000064, 0.002, 0.53, 12.345].map(size)",

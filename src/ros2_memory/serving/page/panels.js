@@ -48,7 +48,7 @@ function showMoment(host, answer, robot, choose) {
   }
   const changes = answer.changes.map((each) => pair(bdi(each.text),
     each.before_s < 0 ? `${lasting(each.before_s)} later` : `${lasting(each.before_s)} before`));
-  host.replaceChildren(el("dl", {}, ...robotRows(answer.robot || robot, extra)),
+  refill(host, el("dl", {}, ...robotRows(answer.robot || robot, extra)),
     el("h3", {}, "It saw"), ...(answer.seen.length ? listing(seenRows(answer.seen, choose), 8)
       : [soft("Nothing.")]),
     ...(changes.length ? [el("h3", {}, "What changed around it"), ...listing(changes)] : []),
@@ -58,7 +58,7 @@ function showStretch(host, answer, choose, point) {
   const rows = [entry("Length", lasting(answer.end - answer.start))];
   if (answer.distance_m !== null) rows.push(entry("Driven", far(answer.distance_m)));
   if (answer.stood_s !== null) rows.push(entry("Stood", lasting(answer.stood_s)));
-  host.replaceChildren(el("dl", {}, ...rows), el("h3", {}, "It saw"),
+  refill(host, el("dl", {}, ...rows), el("h3", {}, "It saw"),
     ...(answer.seen.length ? listing(seenRows(answer.seen, choose), 8) : [soft("Nothing.")]),
     ...(answer.events.length ? [el("h3", {}, "What happened"),
       ...listing(eventRows(answer.events, point))] : []),
@@ -72,7 +72,7 @@ function showSightings(host, answer, point) {
       `${place}${each.in ? ` in ${each.in}` : ""}`);
   });
   const total = answer.total === null ? "there are more" : `${answer.total} in all`;
-  host.replaceChildren(
+  refill(host,
     soft(answer.total === rows.length ? `${counted(rows.length, "sighting")}, newest first.`
       : `The newest ${rows.length} sightings, ${total}.`),
     ...listing(rows, 10), ...notesOf(answer.notes));
@@ -84,7 +84,7 @@ function showNow(host, view, choose, point) {
   const frame = path && path.frame ? [entry("Frame", bdi(path.frame))] : [];
   const seen = newest.map((each) => pair(link(each.label, () => choose(each)), metres(each)));
   const events = view.events.filter((each) => each.kind !== "thing").slice(-LATEST).reverse();
-  host.replaceChildren(
+  refill(host,
     ...(robot ? [el("dl", {}, ...robotRows(robot, frame))] : [soft("Where the robot is, is not known.")]),
     ...(seen.length || (view.counts || {}).sightings
       ? [el("h3", {}, "In view"), ...(seen.length ? listing(seen, AT_ONCE) : [soft("Nothing.")])] : []),
@@ -97,7 +97,7 @@ function showThings(host, view, choose) {
     el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
       each.state === MISSED ? el("span", { class: "warn" }, " not seen where expected") : ""),
     el("span", {}, `${metres(each)} \u00b7 `, seen(each))));
-  host.replaceChildren(...(rows.length ? listing(rows, 10)
+  refill(host, ...(rows.length ? listing(rows, 10)
     : [soft((view.counts || {}).sightings || (view.throughout || []).length
       ? "What was seen has no place on the map. The timeline shows when it was in view."
       : "Nothing was seen in this time.")]));
@@ -133,7 +133,7 @@ function showEvents(host, view, point, choose) {
     .map(([kind, n]) => `${n} ${n === 1 ? ONE[kind] || kind : kind}`).join(", ");
   const isProblem = (each) => PROBLEMS.includes(each.kind);
   const [problems, others] = [shown.filter(isProblem), shown.filter((each) => !isProblem(each))];
-  host.replaceChildren(...(counts ? [soft(counts)] : []),
+  refill(host, ...(counts ? [soft(counts)] : []),
     ...(problems.length ? [el("h3", {}, "Problems"), ...listing(bundled(problems, point))] : []),
     ...(problems.length && others.length ? [el("h3", {}, "All else")] : []),
     ...listing(eventRows(others, point), problems.length ? 4 : 8),
@@ -218,7 +218,7 @@ function showState(host, view) {
       + counted(each.moments, "moment") + (each.refused ? `, ${each.refused} refused` : "")));
   }
   const troubles = troublesOf(status, range, now);
-  host.replaceChildren(
+  refill(host,
     ...(troubles.length || failing ? troubles : [el("p", { class: "good" }, `\u2713 ${SOUND}`)]), list,
     ...notesOf([...new Set([...(range.notes || []), ...(status.notes || [])])]),
     el("p", { class: "soft", id: "since" }));
@@ -235,5 +235,5 @@ function showQuestions(host, questions) {
     el("summary", {}, `${timeOfDay(each.asked)} ${plain(each.tool)} ${plain(each.arguments)}: `
       + `${each.outcome}, ${Math.round(each.ms)} ms`),
     el("pre", {}, each.answer))));
-  host.replaceChildren(...(rows.length ? listing(rows, 8) : [soft("None yet.")]));
+  refill(host, ...(rows.length ? listing(rows, 8) : [soft("None yet.")]));
 }

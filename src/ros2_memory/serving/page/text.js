@@ -38,6 +38,23 @@ function listing(rows, most = AT_ONCE) {
     el("summary", {}, `${rest.length} more`), el("ul", {}, ...rest))];
 }
 
+/* What can be unfolded in an element, by its title without a number before it. */
+function foldsOf(host) {
+  const [folds, times] = [new Map(), new Map()];
+  for (const each of host.querySelectorAll("details")) {
+    const name = each.firstChild.textContent.replace(/^\d+ /, "");
+    times.set(name, (times.get(name) || 0) + 1);
+    folds.set(`${name} ${times.get(name)}`, each);
+  }
+  return folds;
+}
+/* Replaces what an element has; what somebody has unfolded stays so. */
+function refill(host, ...children) {
+  const before = foldsOf(host);
+  host.replaceChildren(...children);
+  for (const [name, each] of foldsOf(host)) each.open ||= Boolean(before.get(name)?.open);
+}
+
 function lasting(seconds) {
   const s = Math.abs(seconds);
   if (s < 9.95) return s.toFixed(1) + " s";

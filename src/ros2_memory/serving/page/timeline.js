@@ -140,7 +140,7 @@ class Timeline {
       const { earliest, latest } = this.view.range;
       const by = dx / this.wide * (latest - earliest);
       this.go(this.span.start + by, this.span.end + by, false);
-    } else if (event.shiftKey || this.marking !== undefined) {
+    } else if ((event.shiftKey && event.type !== "wheel") || this.marking !== undefined) {
       if (this.marking === undefined) this.marking = this.timeAt(from.x);
       const [one, other] = [this.marking, this.timeAt(from.x + dx)];
       this.choose({ t: Math.min(one, other), end: Math.max(one, other), text: "chosen stretch" });

@@ -60,14 +60,10 @@ function drawSpokes() {
 }
 function showTopics(host, reply, plot) {
   const left = reply.topics_total - reply.topics.length;
-  const isOpen = Boolean(host.querySelector("details[open]"));
-  host.replaceChildren(...listing(reply.topics.map((each) => topicRow(each, plot)), MOST_ROWS),
+  refill(host, ...listing(reply.topics.map((each) => topicRow(each, plot)), MOST_ROWS),
     ...(left ? [soft(`${left} more topics are not listed.`)] : []));
   const rest = host.querySelector(":scope > details");
-  if (rest) {
-    rest.open = isOpen;
-    rest.addEventListener("toggle", drawSpokes);
-  }
+  if (rest) rest.addEventListener("toggle", drawSpokes);
   drawSpokes();
 }
 
