@@ -204,6 +204,7 @@ def robot_settings(settings: Settings, name: str) -> Settings:
         places_file = Path(fleet.places.replace("*", name))
         if os.path.isfile(places_file):
             data = replace(data, places_file=places_file)
+    data = replace(data, pose_topic=fleet.pose_topics.get(name, data.pose_topic))
     return replace(
         settings,
         recording=replace(settings.recording, bag_dir=bag_dir),

@@ -443,12 +443,14 @@ class FleetSettings:
     """The robots that one server answers for; none where it answers for `recording.bag_dir`.
 
     `robots` has the bag directories by name; a pattern stands for them, too. `places` is the
-    pattern of the robots' own files of named places. `shared_map`: whether coordinates mean the
-    same place for all robots. `tokens` has, by the file of a token, the robots that it is for.
+    pattern of the robots' own files of named places. `pose_topics` has the `data.pose_topic` of
+    some. `shared_map`: whether coordinates mean the same place for all robots. `tokens` has, by the
+    file of a token, the robots that it is for.
     """
 
     robots: Annotated[dict[RobotName, AnyPath], BeforeValidator(_expand_robots)]
     places: Annotated[Text, AfterValidator(_require_one_star)] | None
+    pose_topics: dict[RobotName, Text]
     shared_map: Flag
     tokens: dict[AnyPath, tuple[RobotName, ...]]
 

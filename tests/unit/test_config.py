@@ -23,6 +23,7 @@ from ros2_memory.config import (
 from ros2_memory.config_sources import Sources, quoted
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.reply import JsonObject
+from tests.support.bags import odom, write_mcap
 from tests.support.examples import examples
 from tests.support.fleets import reply
 from tests.support.memories import ROOT
@@ -171,6 +172,20 @@ def test_a_robot_out_of_reach_is_named_and_the_others_are_served(tmp_path: Path)
     found = reply(fleet, "list_recorded_topics", {})
     assert {name for topic in found["topics"] for name in topic["robot_names"]} == {"r1"}
     assert found["robots_failed"] == {"r2": "refused"}
+
+
+def test_robots_of_a_fleet_may_differ_in_their_topic_of_poses(tmp_path: Path) -> None:
+    for name, topic in (("r1", "/odom"), ("r2", "/wheel_odom")):
+        poses = [
+            dataclasses.replace(odom(second * 10**9, x=second), topic=topic) for second in (1, 2)
+        ]
+        other = dataclasses.replace(odom(10**9), topic="/other/pose")
+        write_mcap(tmp_path / name / "run_0.mcap", [*poses, other])
+    fleet = build_fleet(fleet_of(f"{tmp_path}/*", "fleet.pose_topics={r2: /wheel_odom}"))
+    assert fleet is not None
+    for name, topic in (("r1", "/odom"), ("r2", "/wheel_odom")):
+        found = reply(fleet, "get_position_at", {"robot": name, "timestamp": 2})
+        assert (found["topic"], found["x"]) == (topic, 2.0)
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,9 @@ def test_the_only_odometry_in_a_namespace_places_the_robot_also_beside_its_local
         way = asked(memory, "trajectory_summary", start=T0_S, end=T0_S + 8)
         assert way["distance_m"] == pytest.approx(4.0, abs=0.01)
     else:
-        assert "set data.pose_topic to one of them" in reply["detail"]
+        assert (
+            "set data.pose_topic (for a fleet: fleet.pose_topics) to one of them" in reply["detail"]
+        )
 
 
 @each_way
@@ -673,8 +675,9 @@ def test_of_several_topics_of_poses_the_refusal_says_which_is_best(tmp_path: Pat
     refused = asked(remembered(tmp_path, poses), "get_position_at", timestamp=T0_S)
     assert refused["detail"].endswith(
         "poses are on /filters/global (nav_msgs/msg/Odometry), /filters/local "
-        "(nav_msgs/msg/Odometry): set data.pose_topic to one of them (best to odometry that no "
-        "localisation corrects), or give topic where the tool takes it"
+        "(nav_msgs/msg/Odometry): set data.pose_topic (for a fleet: fleet.pose_topics) to one of "
+        "them (best to odometry that no localisation corrects), or give topic where the tool takes "
+        "it"
     )
     beside = asked(remembered(tmp_path, [*poses, *moved(range(5))]), "visits", x=1.0, y=0.0)
     assert ", or to /tf to place the robot by transforms, or give topic" in beside["detail"]

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 GIVE_TOPIC: Final = "give topic where the tool takes it"
 _DEFAULT_POSES: Final = "/odom"
 """The default of `data.pose_topic`."""
+_OF_FLEET: Final = " (for a fleet: fleet.pose_topics)"
 _ODOMETRY: Final = (_DEFAULT_POSES, "/odometry/filtered", "/odometry/local")
 """The ends of names of odometry, also of the package robot_localization."""
 _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
@@ -167,7 +168,7 @@ def _describe_alternative(view: View, what: str, *, degrees: bool) -> str | None
         topics = unmapped_topics_with(view)
     if topics:
         name, _, _ = topics[0].partition(" ")
-        value = f"={name}" if len(topics) == 1 else f" to one of them{_BEST_POSES[what]}"
+        value = f"={name}" if len(topics) == 1 else f"{_OF_FLEET} to one of them{_BEST_POSES[what]}"
         if what == "position" and len(topics) > 1 and view.moving_topics:
             value += f", or to {view.moving_topics[0]} to place the robot by transforms"
         return f"; {those} are on {listed(topics)}: set data.pose_topic{value}, or {GIVE_TOPIC}"

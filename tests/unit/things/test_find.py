@@ -208,8 +208,8 @@ def test_where_the_robots_poses_are_to_be_chosen_unplaced_detections_say_so(tmp_
         (
             "where the robot was is not known: data.pose_topic is /odom, which these bags do not "
             "have; poses are on /odometry (nav_msgs/msg/Odometry), /pose (nav_msgs/msg/Odometry): "
-            "set data.pose_topic to one of them (best to odometry that no localisation corrects), "
-            "or give topic where the tool takes it"
+            "set data.pose_topic (for a fleet: fleet.pose_topics) to one of them (best to odometry "
+            "that no localisation corrects), or give topic where the tool takes it"
         ),
     ]
 
