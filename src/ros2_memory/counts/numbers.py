@@ -33,7 +33,7 @@ from ros2_memory.core.text import leaves as leaves_by_path
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
-from ros2_memory.history.conditions import note_no_fix
+from ros2_memory.history.conditions import is_number, note_no_fix
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.held_values import note_unnamed
 from ros2_memory.history.no_data import no_data_between, require_fields, resolve_topic
@@ -537,7 +537,8 @@ def count_range(
 ) -> Bins:
     """Returns how many messages of a topic each bin has, and the numbers of fields in them.
 
-    With `by` "value", returns how often and how long the topic held each value (`count_values`).
+    A message that is one number needs no field. With `by` "value", returns how often and how long
+    the topic held each value (`count_values`).
 
     Raises:
         InvalidArgumentsError: there are too many bins, or too many fields for them.
@@ -549,6 +550,9 @@ def count_range(
     if by == "value":
         return count_values(view, name, asked, fields=fields)
     binned = BinnedWindow(view, asked, by, (name,))
+    types = view.timeline.types_of(name)
+    if types and not fields and all(map(is_number, types)):
+        fields = [view.extractor.own_path("data", types[0])]
     names = number_paths(view, name, fields, asked.stop)
     size = len(binned.bins.names)
     if len(names) * size > MOST_CELLS:

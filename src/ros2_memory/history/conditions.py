@@ -67,7 +67,7 @@ def condition_of(view: View, sought: Sought) -> Condition:
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
-    elif not field and types and all(map(_is_number, types)):
+    elif not field and types and all(map(is_number, types)):
         # A message that is one number has no other that could be meant.
         field = "data" if condition_type in _OF_NUMBERS else None
     field = field and field.strip()
@@ -93,7 +93,8 @@ def condition_of(view: View, sought: Sought) -> Condition:
     return replace(condition, tests_by_type=tuple(named))
 
 
-def _is_number(type_name: str) -> bool:
+def is_number(type_name: str) -> bool:
+    """Returns whether each message of a type is one number."""
     return type_name.startswith(NUMBERS) and not type_name.endswith("Array")
 
 

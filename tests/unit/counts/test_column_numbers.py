@@ -223,6 +223,9 @@ def test_the_least_and_greatest_of_whole_numbers_are_exact(
     row = table(asked(memory, "get_topic_in_range", **given, by="hour"))["all"]
     assert (row["value.min"], row["value.max"]) == (min(numbers), max(numbers))
     assert row["value.max_at_unix"] == extremes["max_at"]
+    del given["fields"]  # no other number could be meant
+    bare = table(asked(memory, "get_topic_in_range", **given, by="hour"))["all"]
+    assert (bare == row) == (kind != "Byte")
 
 
 def test_a_field_that_a_topic_has_no_more_is_that_of_its_window(tmp_path: Path) -> None:
