@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from heapq import merge
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -30,6 +30,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.spans import Spans, spans_of, without
@@ -76,6 +77,10 @@ NEWEST_POSE_NS: Final = SILENCE_NS
 _FIXED_FRAMES: Final = frozenset({"earth", "utm"})
 """Frames of REP 105 and of robot_localization that are at rest on earth."""
 _SAME_ORIGIN_M: Final = 0.5
+_ORIGINS: Final[Key[dict[tuple[str, tuple[TimeWindow, ...]], list[str]]]] = Key()
+"""Of a view: by topic of poses and windows, the notes on a map that was laid out anew."""
+_ON_EARTH: Final[Key[dict[str | None, list[str]]]] = Key()
+"""Of a timeline: by frame of the map, the fixed frames to which transforms lead."""
 _MOST_ORIGINS: Final = 12
 """At most this many recordings, evenly spaced, are asked where their map lay."""
 _OLD_NS: Final = NS_PER_S
@@ -444,31 +449,50 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
         )
 
 
-def origin_notes(view: View, topic: str, windows: Iterable[TimeWindow]) -> Iterator[str]:
-    """Yields a sentence if the map lay elsewhere on earth in some recording of poses in windows."""
-    map_frame, recordings = view.limits.map_frame, view.timeline.recordings(topic)
-    if map_frame is None:
-        return
+def origin_notes(view: View, topic: str, windows: Iterable[TimeWindow]) -> Sequence[str]:
+    """Returns a sentence if the map lay elsewhere on earth in some recording of windows."""
+    known = view.memo.of(_ORIGINS, dict)
+    key = (topic, tuple(windows))
+    if key not in known:
+        known[key] = []
+        with suppress(QueryTimeoutError):
+            for frame in _frames_on_earth(view):
+                known[key] += islice(_moves_of_map(view, frame, *key), 1)
+    return known[key]
+
+
+def _frames_on_earth(view: View) -> Sequence[str]:
+    """Returns the frames at rest on earth to which transforms lead from the map."""
+    known = view.timeline.memo.of(_ON_EARTH, dict)
+    map_frame = view.limits.map_frame
+    if map_frame is not None and map_frame not in known:
+        others = sorted(_FIXED_FRAMES - {map_frame})
+        known[map_frame] = [frame for frame in others if connects(view, (map_frame, frame))]
+    return known.get(map_frame, [])
+
+
+def _moves_of_map(
+    view: View, frame: str, topic: str, windows: Sequence[TimeWindow]
+) -> Iterator[str]:
+    """Yields a sentence for each recording whose map lay elsewhere than the first one's."""
     ends = sorted(
         (min(last, window.stop - 1), max(first, window.start), recording)
         for window in windows
-        for recording, (first, last) in recordings.items()
+        for recording, (first, last) in view.timeline.recordings(topic).items()
         if window.overlaps(first, last)
     )
-    for frame in sorted(_FIXED_FRAMES - {map_frame}):
-        places: list[tuple[Ns, Vector3]] = []
-        for at, since, recording in ends[:: -(-len(ends) // _MOST_ORIGINS) or 1]:
-            with suppress(NoDataError, QueryTimeoutError):
-                found = transform_at(view, map_frame, frame, at, recording, explains=False)
-                places.append((since, found.transform.translation))
-        for since, place in places:
-            if (away_m := math.dist(place, places[0][1])) > _SAME_ORIGIN_M:
+    map_frame, origin = view.limits.map_frame or "", None
+    for at, since, recording in ends[:: -(-len(ends) // _MOST_ORIGINS) or 1]:
+        with suppress(NoDataError):
+            found = transform_at(view, map_frame, frame, at, recording, explains=False)
+            place = found.transform.translation
+            origin = place if origin is None else origin
+            if (away_m := math.dist(place, origin)) > _SAME_ORIGIN_M:
                 yield (
                     f"{frame} is {away_m:.2f} m elsewhere in {map_frame} than before "
                     f"{unix_text(since)}, as of a map that was laid out anew: its coordinates name "
                     f"other places than before; data.map_frame={frame} makes them comparable"
                 )
-                break
 
 
 def map_to_choose(view: View, frame_id: str) -> str:
