@@ -162,8 +162,10 @@ def _heard_in(view: View, topic: str) -> list[_Heard]:
         paces: dict[Session, Pace] = {}
         for recording, pace in sorted(recordings, key=lambda item: item[0] in misdated):
             session = view.sessions.session_of(recording)
-            if session not in paces or recording not in misdated:
-                paces[session] = paces.get(session, pace) | pace
+            if session not in paces:
+                paces[session] = pace
+            elif recording not in misdated:
+                paces[session] |= pace
         known[topic] = [
             _Heard(pace.topic.first, pace.end + 1, not pace.is_rare, pace.topic.messages)
             for pace in paces.values()

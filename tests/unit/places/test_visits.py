@@ -259,6 +259,16 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
                 assert visited.get("unknown_s", 0) == found.get("unknown_s", 0)
 
 
+def test_a_state_that_is_said_every_six_seconds_is_rare_and_lasts_through_a_pause(
+    tmp_path: Path,
+) -> None:
+    said = [n for n in range(0, 300, 6) if not 100 < n < 200]
+    messages = [odom(BEGIN + n * S) for n in range(300)]
+    messages += [text(BEGIN + n * S + 1, "calm", topic="/mood") for n in said]
+    [visit] = asked(remembering(tmp_path, messages), "visits", **HERE, **{"while": CALM})["visits"]
+    assert visit["duration_s"] == pytest.approx(299)
+
+
 @pytest.mark.parametrize("split_s", [10.0, 60.0, 10_000.0])
 def test_a_fault_of_a_node_holds_from_its_message_to_its_next_one_while_others_are_well(
     tmp_path: Path, split_s: float
