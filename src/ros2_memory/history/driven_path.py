@@ -96,6 +96,8 @@ _LONGEST_H: Final = 64
 """In a bag that spans more hours a clock was set: decades may lie between two messages."""
 _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a view: by topic of poses, the frame of its newest pose."""
+_OLDEST_FRAMES: Final[Key[dict[str, str]]] = Key()
+"""Of a view: by topic of poses, the frame of its oldest pose; empty if that cannot be read."""
 
 
 def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
@@ -306,6 +308,22 @@ def frame_of_newest_pose(view: View, topic: str) -> str:
     if topic not in frames:
         body = body_of(view, topic)
         frames[topic] = _frame_of_newest(view, topic) if body is None else body.odometry
+    return frames[topic]
+
+
+def frame_of_oldest_pose(view: View, topic: str) -> str:
+    """Returns the frame of a topic's oldest pose, which a robot may have had before an update.
+
+    Empty if it cannot be read; no note says so. Remembers the frame for the call.
+    """
+    frames = view.memo.of(_OLDEST_FRAMES, dict)
+    if topic not in frames:
+        noted_before = view.notes.so_far()
+        oldest = view.stream.first([topic], TimeWindow.everything())
+        message = view.bags.decode(oldest)
+        pose = None if oldest is None else view.extractor.pose(message, oldest.type)
+        frames[topic] = "" if pose is None else pose.frame_id.lstrip("/")
+        view.notes.retract_outside(keep=noted_before)
     return frames[topic]
 
 

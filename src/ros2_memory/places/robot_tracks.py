@@ -47,6 +47,7 @@ from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import (
     body_by_transforms,
     frame_of_newest_pose,
+    frame_of_oldest_pose,
     note_left_out,
 )
 from ros2_memory.history.poses import PoseReader
@@ -101,7 +102,12 @@ class TrackReader:
         self._own_frame = (
             frame_of_newest_pose(view, view.pose_topic) if body is None else body.child
         )
-        self._is_own = body is None and self._own_frame == frame_id
+        # Before an update the robot may have published its poses in another frame.
+        self._is_own = (
+            body is None
+            and self._own_frame == frame_id
+            and frame_of_oldest_pose(view, view.pose_topic) == frame_id
+        )
         self._reader = PoseReader(view)
 
     def track_in(self, window: TimeWindow) -> KnownTrack:
@@ -366,7 +372,7 @@ class TrackReader:
         A note says if it is not the recording's own, or if there is none.
         """
         session = session_placing(self._view, recording, (self._frame_id, self._own_frame), at)
-        if not session:
+        if not session and self._own_frame != self._frame_id:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 

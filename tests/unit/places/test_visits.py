@@ -476,6 +476,24 @@ def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
     assert "changes with every start" not in notes
 
 
+@each_way
+@pytest.mark.parametrize("frames", [("odom", "map"), ("map", "odom")])
+def test_a_robot_whose_poses_are_in_another_frame_since_an_update_was_there_before_it_too(
+    tmp_path: Path, frames: tuple[str, str], *, recalls: bool
+) -> None:
+    for nth, frame_id in enumerate(frames):
+        messages = []
+        for at in range(BEGIN + nth * 100 * S, BEGIN + (nth * 100 + 60) * S, S):
+            pose = odom(at + 1, 0.0 if frame_id == "odom" else 5.0)
+            pose.body.header.frame_id = frame_id  # type: ignore[attr-defined]
+            messages += [tf(at, transform(at, "map", "odom", (5.0, 0.0, 0.0))), pose]
+        write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", messages)
+    reply = asked(memory_of(tmp_path, recalls=recalls), "visits", x=5.0, y=0.0, radius_m=1.0)
+    assert (reply["frame_id"], reply["total"], reply["minutes"]) == ("map", 2, 1.97)
+    assert "no transform places" not in str(reply)
+    assert "unknown_s" not in reply
+
+
 @pytest.mark.parametrize("root", ["site", "map"])
 def test_of_several_runs_the_note_names_the_frame_that_is_or_may_be_the_map(
     tmp_path: Path, root: str
