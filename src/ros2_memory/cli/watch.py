@@ -14,6 +14,7 @@ from rich.console import Console
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.options import AsJson, Bags
 from ros2_memory.cli.output import print_json, print_reply
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import JsonObject
@@ -59,7 +60,10 @@ def watch(
     memory = replace(bags, words=["reader.include_active=true", *(bags.words or ())]).memory()
     with suppress(KeyboardInterrupt):
         for number in itertools.count(1):
-            seen = _observe(memory)
+            try:
+                seen = _observe(memory)
+            except GoneError:  # the store has changed since, and is looked at anew
+                seen = _observe(memory)
             if as_json:
                 print_json(seen)
             else:

@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.bag_dir.state_files import Loss, append_losses
+from ros2_memory.cli import watch
 from ros2_memory.cli.watch import AS_USUAL, assessment
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.scan import count_messages
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap, write_splits
 from tests.support.heartbeats import beat
 from tests.support.program import Program
@@ -58,6 +61,20 @@ def test_each_look_says_of_every_topic_whether_its_rate_is_as_usual(exits: Progr
     assert rows["/odom"].endswith(AS_USUAL)
     assert rows["/chatter"].endswith("silent")
     assert rows["/bumper"].endswith("slow")
+
+
+def test_it_goes_on_where_stored_columns_are_deleted_meanwhile(
+    exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = iter([GoneError()])
+
+    def count(*given: object) -> object:
+        for error in lost:
+            raise error
+        return count_messages(*given)  # type: ignore[arg-type]  # as they were given
+
+    monkeypatch.setattr(watch, "count_messages", count)
+    assert "/odom" in rows_of(exits(0, "watch --count 1").out)
 
 
 @pytest.mark.parametrize("has_earlier", [False, True])
