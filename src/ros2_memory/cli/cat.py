@@ -1,8 +1,8 @@
 """`ros2-memory cat`: the messages of one topic, as lines for people, CSV, or JSON lines."""
 
 import sys
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
 from typing import Annotated, TypeAlias
 
 import typer
@@ -21,6 +21,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
@@ -67,9 +68,10 @@ def cat(
     name = resolve_topic(view, topic)
     window = times.window(memory)
     found = view.stream.messages([name], window, newest_first=tail is not None)
-    chosen = found if most is None else islice(found, min(most, sys.maxsize))
-    messages = chosen if tail is None else reversed([*chosen])
-    rows = extract_values(view, messages, field or (), exact=as_csv or as_json)
+    exact = as_csv or as_json
+    rows: Iterable[Row] = extract_values(view, found, field or (), exact=exact, most=most)
+    if tail is not None:
+        rows = reversed([*rows])
     if as_csv:
         lines = _csv_lines(rows)
     elif as_json:
@@ -93,39 +95,69 @@ def cat(
 
 
 def extract_values(
-    view: View, messages: Iterable[StoredMessage], fields: Sequence[str], *, exact: bool
+    view: View,
+    messages: Iterable[StoredMessage],
+    fields: Sequence[str],
+    *,
+    exact: bool,
+    most: int | None = None,
 ) -> Iterator[Row]:
     """Yields the values of messages: the fields at these dot-paths, or those that replies show.
 
-    `exact`: numbers are not rounded, and arrays are whole. Messages that cannot be decoded are
-    counted in a note.
+    `exact`: numbers are not rounded, and arrays are whole. At most `most` rows; None for all.
+    Messages that cannot be decoded, or lack a field, are counted in notes.
 
     Raises:
-        InvalidArgumentsError: the first message has no such field.
+        InvalidArgumentsError: no message has such fields.
     """
-    extractor, left_out = view.extractor, 0
-    is_first = True
+    count, undecodable, lacking, refusals = 0, 0, set[str](), Counter[str]()
     for stored in messages:
         message = view.bags.decode(stored)
         if message is None:
-            left_out += 1
+            undecodable += 1
             continue
-        if not exact:
-            yield stored.time, extractor.shown(message, stored.type, fields).value
+        try:
+            value = _value_of(view.extractor, message, stored.type, fields, exact=exact)
+        except InvalidArgumentsError as refusal:
+            refusals[str(refusal)] += 1
+            lacking.add(stored.type)
+            if not count and lacking.issuperset(view.timeline.types_of(stored.topic)):
+                break  # no other type may have them
             continue
-        if is_first:  # `exact_at` does not refuse fields that the type lacks
-            extractor.shown(message, stored.type, fields)
-            is_first = False
-        value: JsonValue
-        if fields:
-            value = {path: extractor.exact_at(message, stored.type, path) for path in fields}
-        else:
-            value = extractor.exact(message, stored.type)
         yield stored.time, value
-    if left_out:
+        count += 1
+        if count == most:
+            break
+    if refusals and not count:
+        raise InvalidArgumentsError(next(iter(refusals)))
+    for reason, number in refusals.items():
+        view.notes.add(f"{counted(number, 'message')} left out: {reason}")
+    if undecodable:
         view.notes.complete = False
-        what = counted(left_out, "message")
+        what = counted(undecodable, "message")
         view.notes.add(f"{what} left out that cannot be decoded: `ros2-memory info` shows why")
+
+
+def _value_of(
+    extractor: SchemaExtractor,
+    message: object,
+    type_name: str,
+    fields: Sequence[str],
+    *,
+    exact: bool,
+) -> JsonValue:
+    """Returns the value of a message as `extract_values` yields it.
+
+    Raises:
+        InvalidArgumentsError: the message lacks a field.
+    """
+    if exact and not fields:
+        return extractor.exact(message, type_name)
+    exact_values = {path: extractor.exact_at(message, type_name, path) for path in fields}
+    if exact and None not in exact_values.values():
+        return exact_values
+    shown = extractor.shown(message, type_name, fields)  # which refuses what is absent
+    return exact_values if exact else shown.value
 
 
 def _csv_lines(rows: Iterable[Row]) -> Iterator[str]:

@@ -305,7 +305,7 @@ def read_signals(
         times.append(time)
         rows.append([_number(cells.get(field)) for field in fields])
     notes = [*shown.view.notes.sentences()]
-    if total > len(rows):
+    if total > _MOST_SAMPLES:
         notes.append(f"{len(rows)} of {total} messages are drawn, evenly spaced")
     columns = np.array(rows, np.float64).reshape(-1, len(fields)).T
     signals = dict(zip(fields, columns, strict=True))

@@ -343,6 +343,18 @@ def test_brackets_of_a_path_and_of_a_question_are_shown_as_they_stand(
     assert "asking [/x]" in terminal.getvalue()
 
 
+def test_a_topic_whose_type_changes_is_printed_to_its_end(folder: Path, exits: Program) -> None:
+    write_mcap(folder / "c" / "c_0.mcap", [text(T0 + 300 * NS_PER_S, "parked", "/odom")])
+    write_mcap(folder / "d" / "d_0.mcap", seconds(400, 2, 9.0))
+    for field, tail, kept, left in (("position.x", "-n 99", 21, 1), ("data", "--tail 1", 1, 2)):
+        for form in ("", "--csv", "--json"):
+            printed = exits(0, f"cat /odom . --field {field} {tail} {form}")
+            assert len(printed.out.splitlines()) == kept + (form == "--csv")
+            assert f"{left} message" in printed.err
+            assert f"left out: {'std' if field != 'data' else 'nav'}_msgs/msg/" in printed.err
+    assert "has no field 'none'" in exits(2, "cat /odom . --field none --csv").err
+
+
 def test_a_recorded_number_is_no_time_however_large(tmp_path: Path, exits: Program) -> None:
     free = make("std_msgs/msg/Float64", data=2_147_483_648.5)
     write_mcap(tmp_path / "a" / "a_0.mcap", [Msg("/free", "std_msgs/msg/Float64", T0, free)])
