@@ -53,8 +53,8 @@ def cat(
 ) -> bool:
     """Print the messages of a topic in a time window, each once, by log time.
 
-    By default it prints the fields that the tools' replies show (`describe_type`); --field selects
-    others. CSV and JSON have the exact numbers; text rounds them and shortens long arrays.
+    By default it prints the fields that the tools' replies show; --field selects others, and a
+    wrong one lists all. CSV and JSON have the exact numbers; text rounds them and shortens arrays.
     """
     if as_csv and as_json:
         raise InvalidArgumentsError("give --csv or --json, not both")
