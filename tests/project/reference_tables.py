@@ -68,16 +68,6 @@ def with_section(page: str, name: str, text: str) -> str:
     return f"{before}{begin}\n\n{text}\n\n{end}{after}"
 
 
-def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
-    named = [*columns]
-    head, *lines = (
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |"
-        for line in (named, *rows)
-    )
-    return "\n".join((head, "|---" * len(named) + "|", *lines))
-
-
 def lake_tables() -> str:
     """The columns of each table of a lake; those that the page's head explains are passed over."""
     keys = ((name, *told) for name, told in KEYS.items())
@@ -111,16 +101,15 @@ def codes(cls: type[EpisodicError]) -> set[str]:
     return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
 
 
-def exit_table() -> str:
+def exit_list() -> str:
     """Each command, what it is for, and what its exit codes say, but for success."""
-    rows = [
-        (f"`{name}`", purpose, f"1: {_short(negative)}" if negative else "")
+    lines = [
+        f"- `{name}`: {purpose}" + (f" (1: {_short(negative)})" if negative else "")
         for name, (_, purpose, negative) in COMMANDS.items()
     ]
-    columns = table(("command", "what it is for", "exit code"), rows)
     return (
-        f"{columns}\n\nExit code 0 is success; for others stderr has the reason. Where nothing "
-        f"else is said, {_short(COMMON_EXIT_CODES)}."
+        "In brackets are exit codes. 0 is success; for others stderr has the reason. Where nothing "
+        f"else is said, {_short(COMMON_EXIT_CODES)}.\n\n" + "\n".join(lines)
     )
 
 

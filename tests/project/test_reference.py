@@ -140,7 +140,7 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
 
 
 def test_every_command_and_every_column_of_a_lake_stands_there() -> None:
-    compare("commands", "exits", reference.exit_table())
+    compare("commands", "exits", reference.exit_list())
     compare("lake", "columns", reference.lake_tables())
 
 
