@@ -89,7 +89,6 @@ CALLS: dict[str, dict[str, object]] = {
 """A call of every tool."""
 MISTAKES: dict[str, tuple[str, dict[str, object]]] = {
     "unknown": ("get_topic_at_time", {"topic": "/odm", "timestamp": START_S + 30}),
-    "misspelt": ("get_position_seconds_ago", {"second_ago": 10}),
 }
 """Calls without an answer, by what is wrong with them."""
 
