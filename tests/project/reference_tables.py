@@ -122,12 +122,12 @@ def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
     """Each tool: what it answers, its arguments, a call and the reply.
 
     An argument that several tools describe alike stands once, before them; required ones are bold.
-    A tool that is another one up to now, or some seconds ago, shows neither call nor reply.
+    A tool that is another one up to now, or some seconds ago, is a line behind that one.
     """
     whole = {tool.name: tool for tool in tools}
     counted = Counter(
         line
-        for name, tool in whole.items()
+        for tool in whole.values()
         if _sibling(tool) is None
         for line in _arguments(tool).values()
     )
@@ -137,8 +137,10 @@ def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
     parts = ["### Arguments of several tools", "\n".join(f"- {line}" for line in common)]
     for name, tool in whole.items():
         sibling = _sibling(tool)
-        known = common if sibling is None else [*_arguments(whole[sibling]).values()]
-        parts.append(_tool(tool, None if sibling else replies[name], known))
+        if sibling is None:
+            parts.append(_tool(tool, replies[name], common))
+        else:
+            parts.append(_variant(tool, whole[sibling]))
     return "\n\n".join(parts)
 
 
@@ -183,26 +185,37 @@ def _arguments(tool: Tool) -> dict[str, str]:
     }
 
 
-def _tool(tool: Tool, reply: str | None, known: Iterable[str]) -> str:
+def _tool(tool: Tool, reply: str, common: Iterable[str]) -> str:
     what = tool.description.partition(" Example: ")[0]
-    required: Any = tool.schema.get("required", [])
-    names = {line.partition(":")[0].strip("`") for line in known}
     lines, also = [], []
     for name, line in _arguments(tool).items():
-        shown_name = f"**`{name}`**" if name in required else f"`{name}`"
-        if line in known or (reply is None and name in names):
-            also.append(shown_name)
+        if line in common:
+            also.append(_marked(tool, name))
         else:
-            lines.append(f"- {shown_name}:{line.partition(':')[2]}")
+            lines.append(f"- {_marked(tool, name)}:{line.partition(':')[2]}")
     if also:
-        where = "as there" if reply is None else "as above"
-        lines.append(f"- {where}: {', '.join(also)}")
+        lines.append(f"- as above: {', '.join(also)}")
     wrapped = textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)
     parts = [f"### `{tool.name}`", "\n".join(wrapped), "\n".join(lines) or "No arguments."]
-    if reply is not None:
-        call = json.dumps(CALLS[tool.name], ensure_ascii=False)
-        parts += [f"```json\n{call}\n```"] * (CALLS[tool.name] != {}) + [shown(reply)]
+    call = json.dumps(CALLS[tool.name], ensure_ascii=False)
+    parts += [f"```json\n{call}\n```"] * (CALLS[tool.name] != {}) + [shown(reply)]
     return "\n\n".join(parts)
+
+
+def _variant(tool: Tool, other: Tool) -> str:
+    """The line of a tool that is another one, but for the time that it asks about."""
+    when = tool.description.partition(", ")[2].rstrip(".")
+    properties: Any = tool.schema["properties"]
+    arguments = (
+        _marked(tool, name) + ("" if name in other.arguments else f" ({_kind(schema)})")
+        for name, schema in properties.items()
+    )
+    return f"`{tool.name}` is the same {when}: {', '.join(arguments)}."
+
+
+def _marked(tool: Tool, argument: str) -> str:
+    required: Any = tool.schema.get("required", [])
+    return f"**`{argument}`**" if argument in required else f"`{argument}`"
 
 
 def _default(schema: Mapping[str, Any]) -> str:
