@@ -10,7 +10,6 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from ros2_memory.config import DuckdbNode, Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.lake.tables import KEYS, TABLES
 from ros2_memory.recorder import event_log
-from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.tools.arguments import TIME_KINDS
 from ros2_memory.tools.declaration import Tool
 from tests.support.documented_history import CALLS
@@ -43,7 +41,6 @@ LEVELS = {
     "lasting_if_refused": "error",
     "remark": "warning",
 }
-EXPLAINED = {"warn", "remark", "fail", "lasting", "lasting_faults", "lasting_if_refused"}
 OPTIONS: Mapping[str, tuple[str, str, type]] = {
     "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
     "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),
@@ -324,35 +321,18 @@ def configured_keys() -> set[str]:
     return keys
 
 
-@dataclass(frozen=True, order=True)
-class Event:
-    """One log event as one place in the code writes it."""
-
-    name: str
-    level: str
-    fields: tuple[str, ...]
-
-
-def events() -> list[Event]:
-    """Every log event in the code."""
-    found = {
-        each
-        for path in sorted(SOURCE.rglob("*.py"))
-        for each in _events_of(ast.parse(path.read_text()))
-    }
-    found |= {
-        Event(
-            kind.value,
-            "info",
-            ("recording", *(("topic",) if kind is LineKind.SUBSCRIBED else ())),
-        )
-        for kind in event_log._INFORM
-    }
-    found |= {Event(kind.value, "warning", ("reason", "recording")) for kind in event_log._ADVICE}
-    return sorted(found)
+def events() -> dict[str, set[str]]:
+    """Every log event in the code, with its levels."""
+    found: dict[str, set[str]] = {}
+    for path in SOURCE.rglob("*.py"):
+        for name, level in _events_of(ast.parse(path.read_text())):
+            found.setdefault(name, set()).add(level)
+    found |= {kind.value: {"info"} for kind in event_log._INFORM}
+    found |= {kind.value: {"warning"} for kind in event_log._ADVICE}
+    return found
 
 
-def _events_of(tree: ast.AST) -> Iterator[Event]:
+def _events_of(tree: ast.AST) -> Iterator[tuple[str, str]]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call) or not node.args:
             continue
@@ -360,15 +340,12 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
         if not (isinstance(first, ast.Constant) and isinstance(first.value, str)):
             continue
         if isinstance(node.func, ast.Name) and node.func.id == "Rotation":
-            level = "warning" if "is_fault" in {word.arg for word in node.keywords} else "info"
-            yield Event(first.value, level, ("reason", "recording"))
-        choices = [each for each in ast.walk(node.func) if isinstance(each, ast.Attribute)]
-        loggers = [each for each in choices if each.attr in LEVELS and _is_log(each.value)]
-        for method in loggers:
-            own = [word.arg for word in node.keywords if word.arg]
-            given = ["reason"] if method.attr in EXPLAINED else []
-            traced = ["exception"] if method.attr == "exception" else []
-            yield Event(first.value, LEVELS[method.attr], (*given, *own, *traced))
+            is_fault = "is_fault" in {word.arg for word in node.keywords}
+            yield first.value, "warning" if is_fault else "info"
+        named = [each for each in ast.walk(node.func) if isinstance(each, ast.Attribute)]
+        for method in named:
+            if method.attr in LEVELS and _is_log(method.value):
+                yield first.value, LEVELS[method.attr]
 
 
 def _is_log(node: ast.AST) -> bool:
@@ -378,19 +355,17 @@ def _is_log(node: ast.AST) -> bool:
 
 
 def event_list(page: str) -> str:
-    """The log events whose meaning a page says, by level, with their own fields."""
-    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
+    """The log events whose meaning a page says, by level: the worst that they have."""
+    written = re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE)
     lines: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
-    every = events()
-    for name in [name for name in dict.fromkeys(each.name for each in every) if name in written]:
-        same = [each for each in every if each.name == name]
-        worst, *others = [level for level in lines if level in {each.level for each in same}]
-        fields = dict.fromkeys(field for each in same for field in each.fields)
-        inside = [f"or {level}" for level in others]
-        inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
-        shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
-        lines[worst].append(f"- {shown_name}: {written[name]}")
-    parts = []
-    for level, listed in lines.items():
-        parts += [f"## {level.capitalize()}", "\n".join(listed)]
-    return "\n\n".join(parts)
+    levels_of = events()
+    for name, meaning in sorted(written):
+        levels = [level for level in lines if level in levels_of.get(name, ())]
+        if levels:
+            less = "".join(f" (or {level})" for level in levels[1:])
+            lines[levels[0]].append(f"- `{name}`{less}: {meaning}")
+    return "\n\n".join(
+        part
+        for level, listed in lines.items()
+        for part in (f"## {level.capitalize()}", "\n".join(listed))
+    )

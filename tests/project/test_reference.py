@@ -144,7 +144,7 @@ def test_every_command_and_every_column_of_a_lake_stands_there() -> None:
     compare("lake", "columns", reference.lake_tables())
 
 
-def test_every_log_event_that_is_explained_exists_with_these_fields() -> None:
+def test_every_log_event_that_is_explained_exists() -> None:
     compare("log-events", "events", reference.event_list(page("log-events")))
 
 
