@@ -21,7 +21,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, Span, iso_local
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import copies_in
 from ros2_memory.history.view import View
@@ -407,7 +407,11 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     own = _own_recordings(view.bag_dir)
     earliest, latest = view.snapshot.earliest or 0, view.snapshot.latest or 0
     is_dated = window.overlaps(earliest, latest)
-    misdated = {_recording_of(fault.bag, loose) for fault in view.snapshot.dating.faults}
+    misdated = _misdated(view, loose)
+    if is_dated:  # of a bag that reaches from 1970 to today, what is from today
+        spans = [
+            each._replace(first=max(each.first, misdated.get(each.path, MIN_NS))) for each in spans
+        ]
     going_on: list[_TopicSpan] = []
     for later in sorted(spans):
         going_on = [earlier for earlier in going_on if earlier.last >= later.first]
@@ -419,11 +423,21 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             is_asked &= not is_dated or span.overlaps(earliest, latest)
             pair = earlier.path, later.path
             if is_asked and not view.sessions.are_joined(*pair):
-                is_wrong = own.issuperset(pair) or not misdated.isdisjoint(pair)
+                is_wrong = own.issuperset(pair) or not misdated.keys().isdisjoint(pair)
                 by_clock = is_wrong or _is_short_edge(earlier, later)
                 bags = frozenset(loose_files.get(str(later.path), ()))
                 yield ParallelRecordings(*pair, span, by_clock, bags)
         going_on.append(later)
+
+
+def _misdated(view: View, loose: Mapping[str, str]) -> dict[Path, Ns]:
+    """Returns the recordings that a wrong clock dated, and from when on their dates are right."""
+    misdated: dict[Path, Ns] = {}
+    for fault in view.snapshot.dating.faults:
+        path = _recording_of(fault.bag, loose)
+        since = fault.span[1] + fault.by if fault.kind is FaultyClock.SET_AHEAD else MIN_NS
+        misdated[path] = max(misdated.get(path, MIN_NS), since)
+    return misdated
 
 
 def _recordings_with(view: View, topic: str) -> dict[Path, Span]:

@@ -462,6 +462,25 @@ def test_a_robot_that_boots_in_1970_again_and_again_is_one(tmp_path: Path) -> No
         assert "as after a clock was set back" not in str(asked(memory, tool))
 
 
+def test_a_robot_whose_clock_is_set_while_it_records_is_one_in_each_boot(tmp_path: Path) -> None:
+    for number in range(3):
+        unset = [odom((n + 1) * S, 5.0 * number, n / 10) for n in range(40)]
+        record(tmp_path, f"boot_{number}", [*unset, *drive(5.0 * number, begin=3600 * number)])
+    memory = memory_of(tmp_path)
+    assert warned(memory) == []
+    sought = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
+    calls: dict[str, dict[str, Any]] = {
+        "find_matches": sought,
+        "find_last_match": sought,
+        "trajectory_summary": {"start": T0_S, "end": T0_S + 9000},
+        "find_things": {},
+    }
+    for tool, arguments in calls.items():
+        assert "differ" not in str(asked(memory, tool, **arguments))
+    path = asked(memory, "trajectory_summary", start=0, end=70)
+    assert "as after a clock was set back" in str(path["notes"])
+
+
 def test_a_frame_with_two_parents_is_two_robots_until_a_recording_is_replaced_or_grows(
     tmp_path: Path,
 ) -> None:
