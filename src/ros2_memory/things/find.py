@@ -103,10 +103,10 @@ def find_things(
     undecoded = note_undecoded(view, window)
     view.notes.add(*describe_hung(view, window))
     known = known_things(view, lowest, window)
-    view.notes.retract_outside(asked_window)
-    note_other_frames(view, known, region)
     if known.has_map:
         view.notes.add(*origin_notes(view, view.pose_topic, [window]))
+    view.notes.retract_outside(asked_window)
+    note_other_frames(view, known, region)
     finder = _Finder(known, window, region, places_asked(limits, region, known.frames), now)
     wanted = {known.labels.key(label): label for label in labels}
     found = sorted(finder.find(wanted), key=lambda thing: (-thing.last, thing.label, thing.place))
