@@ -1004,7 +1004,8 @@ def _last_match_in(
         require_recorded(view, TimeWindow(MIN_NS, until))
     match = reverse_search.newest(until)
     if match is None:
-        notes = _notes_on_never(view, sought, reverse_search, until)
+        of_condition = view.notes.sentences()
+        notes = (*of_condition, *_notes_on_never(view, sought, reverse_search, until))
         lists_goals = GOALS in types_matching(view, sought.topic)
         return None, (_ENDED_GOALS, *notes) if lists_goals else notes
     if match.type == GOALS:

@@ -292,10 +292,10 @@ def test_percent_of_what_is_stated_as_a_fraction_is_refused(
     assert above(memory, "find_last_match", value=0.8)["timestamp"] == T0_S
     memory = remembered(tmp_path / "percent", [stated(T0, 91.0), stated(T0 + NS_PER_S, 60.0)])
     assert above(memory, "find_last_match", value=80)["timestamp"] == T0_S
-    assert (
-        f"{field} is percent here: 0.8 is 0.8 %"
-        in above(memory, "find_matches", value=0.8)["notes"]
-    )
+    note = f"{field} is percent here: 0.8 is 0.8 %"
+    assert note in above(memory, "find_matches", value=0.8)["notes"]
+    never = question(memory, "find_last_match", condition_type="below", value=0.8)
+    assert (never["timestamp"], never["notes"]) == (None, [note])
 
 
 @pytest.mark.parametrize("unknown", [math.nan, -1.0])
