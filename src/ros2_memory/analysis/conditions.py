@@ -69,10 +69,10 @@ _EXACT_BELOW: Final = 2**53
 class Contains:
     """Part of a string, or an element of a list.
 
-    A string is found inside any string at any depth (not in the keys), without regard to case. A
-    boolean is found wherever an equal one is. A number is found only in a field, as an element of
-    it: in a whole message it would match every size, level and coordinate. The digits of a number
-    are also searched as a string.
+    A string is found inside any string at any depth (not in the keys), by `caseless`. A boolean is
+    found wherever an equal one is. A number is found only in a field, as an element of it: in a
+    whole message it would match every size, level and coordinate. The digits of a number are also
+    searched as a string.
 
     With `whole`, the needle is found as whole words: `pot` is in "the pot", not in "potato". Its
     words that begin with a minus must not be there: `knife -butter`. In a string that is JSON, one
@@ -146,7 +146,7 @@ class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
     1 and 0 equal true and false. A number equals itself, and the float that a float32 field stores
-    in its place. Strings are compared without regard to case. A string that spells a boolean or a
+    in its place. Strings are compared by `caseless`. A string that spells a boolean or a
     number equals that, too, since planners put values in quotes. In a string that is JSON, the
     labels of its detections are compared, too.
     """

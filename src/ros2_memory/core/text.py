@@ -62,6 +62,8 @@ _JSON: Final = frozenset("[{")
 _STRINGS: Final = re.compile(r'"(?:[^"\\]|\\.)*+"|\\.', re.DOTALL)
 """A string of JSON; or one escape, in a text whose string does not end: else the search would begin
 again at each escaped quote."""
+_ACCENTS: Final = re.compile("[\u0300-\u036f]")
+"""Accents of Latin, Greek and Cyrillic letters; marks of other scripts are vowels or consonants."""
 _MOST_KEYS: Final = 12
 _MOST_KEYS_CHARS: Final = 300
 """Of more or longer paths, a reply lists the first keys only."""
@@ -73,14 +75,17 @@ def looks_like_json(text: str) -> bool:
 
 
 def caseless(text: str) -> str:
-    """Returns a text as texts are compared: without case, and accents in one form (NFC).
+    """Returns a text as texts are compared: without case and accents, else as NFC.
 
     Escapes of letters in a JSON text are resolved.
     """
     if "\\" in text and looks_like_json(text):
         text = _STRINGS.sub(_unescaped, text)
     folded = text.casefold()
-    return folded if folded.isascii() else unicodedata.normalize("NFC", folded)
+    if folded.isascii():
+        return folded
+    bare = _ACCENTS.sub("", unicodedata.normalize("NFD", folded))
+    return unicodedata.normalize("NFC", bare)
 
 
 def _unescaped(match: re.Match[str]) -> str:

@@ -100,7 +100,7 @@ _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 
 def plain(label: str) -> str:
-    """Returns a label without case, with single spaces and accents in one form."""
+    """Returns a label without case and accents, with single spaces."""
     return caseless(_SPACING.sub(" ", label).strip())
 
 

@@ -19,6 +19,7 @@ from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.stored import Letters, PartZones
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import GoneError
+from ros2_memory.core.text import caseless
 from ros2_memory.history.conditions import Sought
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan
@@ -82,11 +83,11 @@ LABELS = ("mug", "big mug", "Tasse", "Straße", "ÉCLAIR", "x7", "éclair_2")
     st.text("abés7_ -", min_size=1, max_size=4),
 )
 def test_letters_rule_out_no_text_that_has_them(texts: list[str], needle: str) -> None:
-    column, folded = Texts.of(texts), needle.casefold()
+    column, folded = Texts.of(texts), caseless(needle)
     letters = Letters.of(column)
     assert letters is not None
     may = letters.may_have(folded)
-    has = np.array([folded in word.casefold() for word in column.values()], np.bool_)
+    has = np.array([folded in caseless(word) for word in column.values()], np.bool_)
     assert may.size == len(texts)
     assert not (has & ~may).any()
     if folded.isalpha():

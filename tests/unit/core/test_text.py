@@ -50,4 +50,4 @@ def test_a_glob_of_many_stars_takes_no_long_search() -> None:
 def test_escapes_of_a_string_that_does_not_end_take_no_long_search() -> None:
     hostile = '{"' + '\\"' * 200_000
     assert caseless(hostile) == hostile
-    assert caseless(f'["\\u00c4", {hostile}') == f'["ä", {hostile}'
+    assert caseless(f'["\\u00c4", {hostile}') == f'["a", {hostile}'

@@ -585,6 +585,20 @@ def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
 
 
 @each_way
+@pytest.mark.parametrize("asked_for", ["ines", "Inês", "INE\u0302S"])
+def test_a_name_is_found_with_and_without_its_accents(
+    tmp_path: Path, recalls: bool, asked_for: str
+) -> None:
+    said = [text(BEGIN + n * S, name, topic="/operator") for n, name in enumerate(("Ana", "Inês"))]
+    memory = remembered(tmp_path, said, recalls=recalls)
+    for kind in ("contains", "contains_word", "equals"):
+        given = {"topic": "/operator", "condition_type": kind, "value": asked_for}
+        assert asked(memory, "find_last_match", **given)["value"] == {"value": "Inês"}
+    given = {"topic": "/operator", "condition_type": "contains", "value": "がか"}
+    assert asked(memory, "find_last_match", **given) is None
+
+
+@each_way
 def test_letters_that_json_escapes_are_found(tmp_path: Path, *, recalls: bool) -> None:
     seen = [json.dumps({"label": label}) for label in ("кружка", "cup", 'the "big" one')]
     said = [text(BEGIN + n * S, word, topic="/seen") for n, word in enumerate(seen)]
