@@ -6,18 +6,20 @@ from typing import Any
 
 import pytest
 
+from ros2_memory.history.context import Memory
 from tests.support.bags import (
     McapLayout,
     along_x,
     battery,
     boolean,
+    in_order,
     odom,
     text,
     write_mcap,
     write_splits,
 )
 from tests.support.clocks import FixedClock
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -44,24 +46,23 @@ def test_of_more_changes_than_memory_holds_the_first_are_counted_and_a_note_says
     """It toggles each second for 100 s; no question may know of more than 25 changes."""
     monkeypatch.setattr("ros2_memory.analysis.topic_events.MAX_EVENTS", 25)
     write_splits(tmp_path, [boolean(T0 + at * S, at % 2 == 1, BUMPER) for at in range(100)], 10)
-    counted = matches(tmp_path, BUMPER, 0, 99, recalls=recalls, by="day")
+    counted = matches(memory_of(tmp_path, recalls=recalls), BUMPER, 0, 99, by="day")
     whole = table(counted)["all"]
     assert (whole["count"], whole["seconds"], whole["last_unix"]) == (13, 12, T0 / S + 25)
     assert f"{BUMPER} changes too often to count all: {99 - 25} more" in counted["notes"]
 
 
-def matches(
-    bag_dir: Path, topic: str, first: float, last: float, *, recalls: bool, **more: object
-) -> Any:
+def matches(memory: Memory, topic: str, first: float, last: float, **more: object) -> Any:
     given = {"topic": topic, "condition_type": "equals", "value": True, **more}
-    memory = memory_of(bag_dir, recalls=recalls)
     return asked(memory, "find_matches", start=T0 / S + first, end=T0 / S + last, **given)
 
 
 @each_way
-@pytest.mark.parametrize(
-    ("topic", "first", "last", "held", "began"),
-    [
+def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_window(
+    bag_dir: Path, recalls: bool
+) -> None:
+    memory = memory_of(bag_dir, recalls=recalls)
+    for topic, first, last, held, began in (
         (DOCKED, 0, 1000, 600, 2),
         (DOCKED, 0, 900, 500, 2),
         (DOCKED, 50, 350, 250, 1),
@@ -70,14 +71,9 @@ def matches(
         (DOCKED, 450, 650, 0, 0),
         (BUMPER, 0, 902, 202, 1),
         (BUMPER, 0, 703, 3, 1),
-    ],
-)
-def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_window(
-    bag_dir: Path, topic: str, first: int, last: int, held: int, began: int, recalls: bool
-) -> None:
-    counted = matches(bag_dir, topic, first, last, by="day", recalls=recalls)
-    whole = table(counted)["all"]
-    assert (whole["seconds"], whole["count"]) == (held, began)
+    ):
+        whole = table(matches(memory, topic, first, last, by="day"))["all"]
+        assert (whole["seconds"], whole["count"]) == (held, began), (topic, first, last)
 
 
 @each_way
@@ -124,18 +120,15 @@ def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message
     messages = [boolean(T0 + at * S, value, BUMPER) for at, value in (*changes, (115, True))]
     messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(120) if not 100 <= at < 110]
     write_splits(tmp_path, messages)
+    memory = memory_of(tmp_path, recalls=recalls)
     for first, began in ((0, 3), (50, 3), (61, 2), (92, 1), (98, 0)):
-        counted = matches(tmp_path, BUMPER, first, 120, by="hour", recalls=recalls)
+        counted = matches(memory, BUMPER, first, 120, by="hour")
         assert table(counted)["all"]["count"] == began, first
 
 
 @each_way
-@pytest.mark.parametrize(
-    ("first", "last", "held", "began"),
-    [(0, 3000, 2249, 2), (100, 900, 600, 1), (100, 500, 400, 0), (700, 3000, 1699, 1)],
-)
 def test_a_boolean_that_is_said_when_it_changes_holds_from_before_the_window_and_to_its_end(
-    tmp_path: Path, first: int, last: int, held: int, began: int, recalls: bool
+    tmp_path: Path, recalls: bool
 ) -> None:
     """True from 50 s on and from 800 s on; after the pause from 2499 s on it is not known."""
     said = ((10, False), (50, True), (600, False), (800, True))
@@ -143,8 +136,11 @@ def test_a_boolean_that_is_said_when_it_changes_holds_from_before_the_window_and
         messages = [boolean(T0 + at * S, value, DOCKED) for at, value in said if at in recorded]
         messages += [odom(T0 + at * S, 0.0, 0.0) for at in recorded]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-    whole = table(matches(tmp_path, DOCKED, first, last, by="day", recalls=recalls))["all"]
-    assert (whole["seconds"], whole["count"]) == (held, began)
+    memory = memory_of(tmp_path, recalls=recalls)
+    windows = (0, 3000, 2249, 2), (100, 900, 600, 1), (100, 500, 400, 0), (700, 3000, 1699, 1)
+    for first, last, held, began in windows:
+        whole = table(matches(memory, DOCKED, first, last, by="day"))["all"]
+        assert (whole["seconds"], whole["count"]) == (held, began), first
 
 
 @pytest.mark.parametrize(("split_s", "recalls"), [(10, False), (30, True), (600, True)])
@@ -157,12 +153,13 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     messages = [boolean(T0 + at * S, *said) for at, *said in zip(times, bumped, strict=True)]
     messages += along_x(T0, 300)
     write_splits(tmp_path, messages, split_s)
+    memory = memory_of(tmp_path, recalls=recalls)
 
     def whole(first: int, last: int, by: str = "hour") -> list[float]:
-        answer = table(matches(tmp_path, BUMPER, first, last, by=by, recalls=recalls))["all"]
+        answer = table(matches(memory, BUMPER, first, last, by=by))["all"]
         return [answer["count"], answer["seconds"]]
 
-    rows = matches(tmp_path, BUMPER, 0, 300, recalls=recalls)["sightings"]
+    rows = matches(memory, BUMPER, 0, 300)["sightings"]
     assert [row["duration_s"] for row in rows] == [1, 30, 34]
     assert whole(0, 300) == [2, 65]
     assert whole(0, 300, "value")[1] == 65
@@ -171,41 +168,27 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
 
 
 @each_way
-@pytest.mark.parametrize(
-    ("first", "last", "began", "held"),
-    [
+def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after_a_gap(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """As of a dock; nothing is recorded from 7999 to 8500 s, or on."""
+    changes = ((100, False), (4000, True), (5000, False), (6000, True))
+    messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
+    write_splits(tmp_path, [*messages, *along_x(T0, 8000)], 2000)
+    found = matches(memory_of(tmp_path, recalls=recalls), BUMPER, 0, 10_000)["sightings"]
+    assert [row["duration_s"] for row in found] == [1999, 1000]
+    write_splits(tmp_path, along_x(T0 + 8500 * S, 1501), 2000)
+    matched = partial(matches, memory_of(tmp_path, recalls=recalls), BUMPER)
+    for first, last, began, held in (
         (0, 10_000, 2, 1000 + 1999),
         (4500, 4800, 0, 300),
         (3000, 4500, 1, 500),
         (4500, 7000, 1, 500 + 1000),
         (7500, 10_000, 0, 499),
         (8500, 9500, 0, 0),
-    ],
-)
-def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after_a_gap(
-    tmp_path: Path, first: int, last: int, began: int, held: int, recalls: bool
-) -> None:
-    """Nothing is recorded from 7999 to 8500 s."""
-    changes = ((100, False), (4000, True), (5000, False), (6000, True))
-    messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
-    messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(10_001) if not 8000 <= at < 8500]
-    write_splits(tmp_path, messages, 2000)
-    counted = matches(tmp_path, BUMPER, first, last, by="hour", recalls=recalls)
-    whole = table(counted)["all"]
-    assert (whole["count"], whole["seconds"]) == (began, held)
-
-
-@each_way
-def test_a_boolean_of_a_rare_topic_lasts_until_it_toggles_back(
-    tmp_path: Path, recalls: bool
-) -> None:
-    """As of a dock; nothing is recorded from 7999 s on. It lasts as long as with `by`."""
-    changes = ((100, False), (4000, True), (5000, False), (6000, True))
-    messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
-    messages += along_x(T0, 8000)
-    write_splits(tmp_path, messages, 2000)
-    found = matches(tmp_path, BUMPER, 0, 10_000, recalls=recalls)["sightings"]
-    assert [row["duration_s"] for row in found] == [1999.0, 1000.0]
+    ):
+        whole = table(matched(first, last, by="hour"))["all"]
+        assert (whole["count"], whole["seconds"]) == (began, held), first
 
 
 TRUE = 1_784_030_400
@@ -252,15 +235,9 @@ def test_a_rare_measurement_that_falls_silent_is_not_known_any_more(
     tmp_path: Path, recalls: bool
 ) -> None:
     levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
-    write_mcap(
-        tmp_path / "rec" / "rec_0.mcap",
-        sorted(
-            [*levels, *(odom(T0 + at * S, 0.0) for at in range(1001))],
-            key=lambda message: message.log_time,
-        ),
-    )
+    memory = remembered(tmp_path, in_order([*levels, *along_x(T0, 1001)]), recalls=recalls)
     given = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
-    reply = asked(memory_of(tmp_path, recalls=recalls), "find_matches", value=0, by="day", **given)
+    reply = asked(memory, "find_matches", value=0, by="day", **given)
     assert table(reply)["all"]["topic_s"] == pytest.approx(400, abs=1)
 
 
@@ -273,8 +250,8 @@ def test_a_while_on_a_rare_measurement_ends_where_that_falls_silent(
     other = [boolean(T0 + at * S, True) for at in range(1001)]
     write_splits(tmp_path, [*levels, *moving, *other], 100)
     charged = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
-    counted = matches(
-        tmp_path, BUMPER, 0, 1000, recalls=recalls, by="day", **{"while": {**charged, "value": 0.2}}
-    )
+    memory = memory_of(tmp_path, recalls=recalls)
+    scope = {"while": {**charged, "value": 0.2}}
+    counted = matches(memory, BUMPER, 0, 1000, by="day", **scope)
     whole = table(counted)["all"]
     assert (whole["seconds"], whole["unknown_s"]) == (400, 600)
