@@ -24,6 +24,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     write_db3,
     write_mcap,
@@ -70,9 +71,11 @@ class Good:
 def run_of(start_s: int, *, prefix: str = "", frames: str = "", hz: int = 10) -> tuple[Msg, ...]:
     """A few seconds of a robot: what topics and types a bag holds, it holds of all kinds."""
     messages = [
-        tf(
+        tf_of(
             start_s * NS_PER_S,
-            transform(start_s * NS_PER_S, f"{frames}base", f"{frames}laser", (0.2, 0.0, 0.1)),
+            f"{frames}base",
+            f"{frames}laser",
+            (0.2, 0.0, 0.1),
             topic="/tf_static",
         )
     ]

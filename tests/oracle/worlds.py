@@ -21,6 +21,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     write_db3,
     write_mcap,
@@ -72,10 +73,10 @@ def drifting_map(folder: Path, draw: Random) -> World:
         x, y, yaw, speed = _along(legs, tick / 50)
         noise = [draw.gauss(0, 0.005), draw.gauss(0, 0.005)]
         messages.append(odom(at, x + noise[0], y + noise[1], yaw, vx=speed))
-        messages.append(tf(at, transform(at, "odom", "base_link", (x, y, 0.0), yaw)))
+        messages.append(tf_of(at, "odom", "base_link", (x, y, 0.0), yaw))
         if tick % 25 == 0:
             drift = 0.02 * math.sin(tick / 300)
-            messages.append(tf(at, transform(at, "map", "odom", (1.0 + drift, -2.0, 0.0), drift)))
+            messages.append(tf_of(at, "map", "odom", (1.0 + drift, -2.0, 0.0), drift))
         if tick % 500 == 0:
             mount = transform(at, "base_link", "camera", (0.2, 0.0, 0.5), 0.3)
             messages.append(tf(at, mount, topic="/tf_static"))
@@ -99,8 +100,8 @@ def two_robots(folder: Path, draw: Random) -> World:
     for tick in range(40 * 20):
         at = START + tick * S // 20
         boat.append(_framed(odom(at, 0.05 * tick, 0.0, vx=1.0, topic="/boat/odom"), "boat_odom"))
-        boat.append(tf(at, transform(at, "map", "boat_odom", (0.01 * tick, 3.0, 0.0))))
-        boat.append(tf(at, transform(at, "boat_odom", "boat", (0.05 * tick, 0.0, 0.0))))
+        boat.append(tf_of(at, "map", "boat_odom", (0.01 * tick, 3.0, 0.0)))
+        boat.append(tf_of(at, "boat_odom", "boat", (0.05 * tick, 0.0, 0.0)))
     written(folder / "boat", boat, layout=PACKED)
     later = START + 3600 * S
     fixed = transform(later, "map", "cart_odom", (5.0, 5.0, 0.0), 0.5)
@@ -109,7 +110,7 @@ def two_robots(folder: Path, draw: Random) -> World:
         at = later + tick * S // 30
         pose = odom(at, 0.01 * tick, 0.5, 0.1, vx=0.3, topic="/cart/odom")
         cart.append(_framed(pose, "cart_odom"))
-        cart.append(tf(at, transform(at, "cart_odom", "cart", (0.01 * tick, 0.5, 0.0), 0.1)))
+        cart.append(tf_of(at, "cart_odom", "cart", (0.01 * tick, 0.5, 0.0), 0.1))
         if tick % 40 == 0:
             cart.append(_status(at, draw))
     written(folder / "cart", cart, split_s=7, layout=PACKED)

@@ -397,6 +397,20 @@ def tf(ns: int, *transforms: object, topic: str = "/tf", log_time: int | None = 
     return Msg(topic, "tf2_msgs/msg/TFMessage", ns if log_time is None else log_time, body, ns)
 
 
+def tf_of(
+    ns: int,
+    parent: str,
+    child: str,
+    xyz: tuple[float, float, float],
+    yaw: float = 0.0,
+    *,
+    topic: str = "/tf",
+    log_time: int | None = None,
+) -> Msg:
+    """A message of one transform."""
+    return tf(ns, transform(ns, parent, child, xyz, yaw), topic=topic, log_time=log_time)
+
+
 def text(ns: int, data: str, topic: str = "/chatter") -> Msg:
     return Msg(topic, "std_msgs/msg/String", ns, make("std_msgs/msg/String", data=data))
 

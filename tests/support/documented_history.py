@@ -20,7 +20,17 @@ from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_save
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    detections,
+    odom,
+    text,
+    tf,
+    tf_of,
+    transform,
+    write_mcap,
+)
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import recorder_at_work
@@ -107,7 +117,7 @@ def messages() -> Iterator[Msg]:
         across = max(tenth - 400, 0) / 20
         yaw = math.pi / 2 if tenth >= 400 else 0.0
         yield odom(at, along, across, yaw, vx=0.0 if 200 <= tenth < 400 else 0.5)
-        yield tf(at, transform(at, "odom", "base_link", (along, across, 0.0), yaw))
+        yield tf_of(at, "odom", "base_link", (along, across, 0.0), yaw)
         if tenth % 20 == 0:
             seen = "cup, scissors" if 220 <= tenth < 390 else "table"
             yield text(at, seen, "/vision/scene/scene_objects")

@@ -17,16 +17,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import (
-    McapLayout,
-    Msg,
-    boolean,
-    detections,
-    odom,
-    tf,
-    transform,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf_of, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 
@@ -100,15 +91,13 @@ def seeded(name: str, *, shift_s: int = 0) -> SeededRobot:
 def write_robot(robot: SeededRobot, bag_dir: Path) -> Path:
     """Writes its bags, dated as their recorder would have left them."""
     first = robot.start_s * NS_PER_S
-    messages: list[Msg] = [
-        tf(first, transform(first, "map", "odom", (1.0, 2.0, 0.0)), topic="/tf_static")
-    ]
+    messages: list[Msg] = [tf_of(first, "map", "odom", (1.0, 2.0, 0.0), topic="/tf_static")]
     seen = dict(robot.seen)
     for second in range(LENGTH_S):
         at = first + second * NS_PER_S
         x = math.sin(second / 10) * 3
         messages.append(odom(at, x, 0.1 * second, 0.0, vx=0.3))
-        messages.append(tf(at, transform(at, "odom", "base_link", (x, 0.1 * second, 0.0), 0.0)))
+        messages.append(tf_of(at, "odom", "base_link", (x, 0.1 * second, 0.0), 0.0))
         if second % 20 == 0:
             messages.append(boolean(at, second == 20, topic="/is_docked"))
         if robot.start_s + second in seen:

@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from random import Random
 
-from tests.support.bags import Msg, detections, mcap_content, odom, splits_of, tf, transform
+from tests.support.bags import Msg, detections, mcap_content, odom, splits_of, tf, tf_of, transform
 
 S = 10**9
 MS = 10**6
@@ -47,9 +47,7 @@ def moving_map(
     x, y, heading, stands = 0.0, 0.0, 0.0, 30
     target = 1
     dx, dy, turn = 0.5, -0.3, 0.2
-    messages.append(
-        tf(BEGIN, transform(BEGIN, "base_link", "cam", (0.2, 0, 0.5)), topic="/tf_static")
-    )
+    messages.append(tf_of(BEGIN, "base_link", "cam", (0.2, 0, 0.5), topic="/tf_static"))
     stride = 0.4 / rate
     for step in range(seconds * rate):
         at = BEGIN + step * S // rate

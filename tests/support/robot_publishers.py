@@ -56,6 +56,7 @@ from tests.support.bags import (
     stamp,
     text,
     tf,
+    tf_of,
     transform,
     typestore,
 )
@@ -224,7 +225,7 @@ class Messages:
         at, (x, y, yaw) = self._t0 + round(t * 1e9), pose(t)
         made: dict[str, Callable[[], Msg]] = {
             "/odom": lambda: odom(at, x, y, yaw, vx=RADIUS * TURN_RATE, wz=TURN_RATE),
-            "/tf": lambda: tf(at, transform(at, "odom", "base_link", (x, y, 0.0), yaw)),
+            "/tf": lambda: tf_of(at, "odom", "base_link", (x, y, 0.0), yaw),
             "/tf_static": lambda: tf(
                 at, *(transform(at, "base_link", name, place) for name, place in _SENSORS.items())
             ),

@@ -28,6 +28,7 @@ from tests.support.bags import (
     quaternion,
     text,
     tf,
+    tf_of,
     transform,
     write_mcap,
 )
@@ -323,9 +324,7 @@ def test_a_refusal_names_the_field_that_a_type_of_no_known_velocity_has(tmp_path
 def carried_by(parent: str, begin_s: int, y: float) -> list[Msg]:
     """Half a minute of transforms of the body, driving at 1 m/s."""
     times = [T0 + begin_s * S + n * S // 10 for n in range(301)]
-    return [
-        tf(at, transform(at, parent, "base_link", (n / 10, y, 0.0))) for n, at in enumerate(times)
-    ]
+    return [tf_of(at, parent, "base_link", (n / 10, y, 0.0)) for n, at in enumerate(times)]
 
 
 def test_a_body_that_another_run_hangs_below_another_frame_is_placed_in_both(
@@ -457,7 +456,7 @@ def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool
     messages: list[Msg] = []
     for tenth in range(600):
         at = T0 + tenth * S // 10
-        messages.append(tf(at, transform(at, "map", "odom", (1.0, 0.0, 0.0))))
+        messages.append(tf_of(at, "map", "odom", (1.0, 0.0, 0.0)))
         if tenth % 10 == 0 and not 200 < tenth < 400:
             messages.append(tf(at + 1, transform(at, "odom", "base_link", (tenth / 10, 0.0, 0.0))))
     memory = remembered(tmp_path, messages, recalls=recalls)
@@ -554,7 +553,7 @@ def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
 
 
 def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_path: Path) -> None:
-    placed = [tf(T0, transform(T0, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static")]
+    placed = [tf_of(T0, "map", "odom", (10.0, 0.0, 0.0), topic="/tf_static")]
     messages = [*placed, detections(T0 + 30 * S, ["cup"], at=(0.1, 0.0, 0.0))]
     for n in range(60):
         at = T0 + n * S
@@ -582,7 +581,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
 ) -> None:
     """What was found stays, where the robot was is left out."""
     messages = along_x(T0, 60, mps=0.1)
-    messages += [tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (5, 0, 0))) for n in range(20)]
+    messages += [tf_of(T0 + n * S, "map", "odom", (5, 0, 0)) for n in range(20)]
     messages += [text(T0 + n * S + 1, "hello") for n in (10, 50)]
     memory = remembered(tmp_path, messages)
     later = {"start": T0_S + 40, "end": T0_S + 59}
@@ -610,9 +609,7 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
 def test_a_position_says_where_it_is_not_known_which_place_that_is(tmp_path: Path) -> None:
     """The newest pose is newer than the newest transform to the map, as it mostly is: by 1 s."""
     messages = along_x(T0, 70, mps=0.1)
-    messages += [
-        tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(50)
-    ]
+    messages += [tf_of(T0 + n * S, "map", "odom", (50, 0, 0)) for n in range(50)]
     den = Place("den", "map", Circle(55.0, 0.0, 5.0))
     memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
     for second in (30, 50):
@@ -629,9 +626,7 @@ def test_coordinates_beside_a_place_are_in_its_frame_in_compare_as_in_visits(
     tmp_path: Path,
 ) -> None:
     messages = along_x(T0, 120, mps=0.1)
-    messages += [
-        tf(T0 + n * S, transform(T0 + n * S, "map", "odom", (50, 0, 0))) for n in range(120)
-    ]
+    messages += [tf_of(T0 + n * S, "map", "odom", (50, 0, 0)) for n in range(120)]
     den = Place("den", "odom", Circle(9.0, 0.0, 0.5))
     memory = remembered(tmp_path, messages, limits=QuerySettings(places=(den,)))
     where = {"den": "den", "spot": {"x": 3.0, "y": 0.0, "radius_m": 1.0}}
@@ -694,7 +689,7 @@ def test_a_pose_that_a_rare_correction_of_the_map_does_not_reach_yet_gives_way_t
         body = transform(at, "odom", "base_link", (x, 0.0, 0.0), 0.0)
         messages += [odom(at, x, 0.0, 0.0), tf(at, body)]
         if nth % 10 == 1:
-            messages.append(tf(at, transform(at, "map", "odom", (3.0, 0.0, 0.0), 0.0)))
+            messages.append(tf_of(at, "map", "odom", (3.0, 0.0, 0.0), 0.0))
     write_mcap(tmp_path / "run_0.mcap", messages)
     ask = partial(asked, memory_of(tmp_path), "get_position_at", topic=topic, frame_id="map")
     assert "no transform" in ask(timestamp=T0_S + 4.95)["detail"]

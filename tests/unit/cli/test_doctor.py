@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import heartbeats, stub_ros2
-from tests.support.bags import McapLayout, Msg, along_x, in_order, odom, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, along_x, in_order, odom, tf_of, write_mcap
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.program import Program
 from tests.unit.cli.conftest import Using, left
@@ -339,10 +339,7 @@ def test_poses_that_are_to_be_chosen_and_a_map_of_another_name_are_told(
     [bag] = robot.glob("rec/*.mcap")
     now = time.time_ns()
     placed = [odom(now - n * NS_PER_S, n / 10, 0.0, topic="/odometry") for n in range(20, 40)]
-    site = [
-        tf(message.log_time, transform(message.log_time, "site", "odom", (1.0, 0.0, 0.0)))
-        for message in placed
-    ]
+    site = [tf_of(message.log_time, "site", "odom", (1.0, 0.0, 0.0)) for message in placed]
     others = [replace(message, topic="/fused") for message in placed]
     write_mcap(bag, in_order([*placed, *others, *site]))
     beat(robot, subscribed=("/odometry",))

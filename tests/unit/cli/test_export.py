@@ -23,17 +23,7 @@ from ros2_memory.history.bag_access import StoredMessage
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import (
-    McapLayout,
-    Msg,
-    along_x,
-    odom,
-    text,
-    tf,
-    transform,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, Msg, along_x, odom, text, tf_of, write_db3, write_mcap
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import memory_of
 from tests.support.program import Program
@@ -96,7 +86,7 @@ def things(writer: McapFile) -> None:
 def test_where_nothing_is_recorded_latched_messages_of_before_are_no_export(
     bag_dir: Path, tmp_path: Path, exits: Program
 ) -> None:
-    mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+    mount = tf_of(T0, "base_link", "laser", (0.1, 0.0, 0.0), topic="/tf_static")
     write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
     out = tmp_path / "out.mcap"
     asked = f"export --start {T0 / NS_PER_S + 5000} --end {T0 / NS_PER_S + 6000} --mcap {out}"

@@ -25,7 +25,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.view import View
-from tests.support.bags import Msg, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, odom, tf_of, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.support.examples import examples
 
@@ -182,7 +182,7 @@ def test_stretches_follow_each_other_up_to_a_message_dated_at_the_end_of_64_bits
 def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Path) -> None:
     for number in range(14):
         start = T0 + number * 300 * S
-        fixed = tf(start, transform(start, "map", "odom", (1, 0, 0)), topic="/tf_static")
+        fixed = tf_of(start, "map", "odom", (1, 0, 0), topic="/tf_static")
         torn = Msg("/tf_static", "tf2_msgs/msg/TFMessage", start + S, b"\0\1\0\0\xff\xff\xff\x7f")
         messages = [fixed, *[torn] * (number == 2), *driven(number)]
         write_mcap(tmp_path / "rec" / f"{number}.mcap", messages)

@@ -46,8 +46,7 @@ from tests.support.bags import (
     log_entry,
     odom,
     text,
-    tf,
-    transform,
+    tf_of,
     typestore,
     write_mcap,
 )
@@ -501,7 +500,7 @@ def _published(draw: Random, start: int, seconds: int, quiet: range) -> list[Msg
             some.append(diagnostics(at, motors=(told.randrange(3), "hot"), camera=(n % 2, "")))
             some.append(goals(at, {n // 20: told.choice([2, 2, 4, 6])}))
         if n == 1:
-            some.append(tf(at, transform(at, "base_link", "cam", (x, 0, 0)), topic="/tf_static"))
+            some.append(tf_of(at, "base_link", "cam", (x, 0, 0), topic="/tf_static"))
         for message in some:
             late = draw.choice([MS, MS, draw.randrange(4000) * MS]) + n
             found.append(replace(message, log_time=at + late, publish_time=at))

@@ -20,7 +20,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
-from tests.support.bags import Msg, boolean, in_order, odom, tf, transform, write_splits
+from tests.support.bags import Msg, boolean, in_order, odom, tf, tf_of, transform, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of
 
@@ -29,7 +29,7 @@ T0 = 1_784_000_000 * S
 
 
 def fixed(at: int, parent: str, child: str, x: float) -> Msg:
-    return tf(at, transform(at, parent, child, (x, 0.0, 0.0)), topic="/tf_static")
+    return tf_of(at, parent, child, (x, 0.0, 0.0), topic="/tf_static")
 
 
 def ticks(begin: int, seconds: int) -> range:
@@ -38,7 +38,7 @@ def ticks(begin: int, seconds: int) -> range:
 
 def moving(begin: int, seconds: int, parent: str, child: str, x: float, mps: float) -> list[Msg]:
     places = [(at, x + mps * (at - begin) / S) for at in ticks(begin, seconds)]
-    return [tf(at, transform(at, parent, child, (x, 0.0, 0.0))) for at, x in places]
+    return [tf_of(at, parent, child, (x, 0.0, 0.0)) for at, x in places]
 
 
 def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
@@ -288,7 +288,7 @@ def test_a_frame_that_two_nodes_place_in_two_parents_is_named(tmp_path: Path) ->
     """As by odometry and by a localiser, which should place the frame of odometry instead."""
     messages = moving(T0, 20, "odom", "base_link", 0.0, 0.1)
     for at in range(T0, T0 + 20 * S, S // 2):
-        messages.append(tf(at + 1000, transform(at + 1000, "map", "base_link", (1.0, 0.0, 0.0))))
+        messages.append(tf_of(at + 1000, "map", "base_link", (1.0, 0.0, 0.0)))
     record(tmp_path / "one", in_order(messages))
     memory = memory_of(tmp_path)
     for child in ("odom", "base_link"):

@@ -50,6 +50,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     write_db3,
     write_mcap,
@@ -76,7 +77,7 @@ def messages(start_s: int) -> list[Msg]:
         at = T0 + second * S
         made += [
             odom(at, second * 0.1),
-            tf(at, transform(at, "odom", "base_link", (second * 0.1, 0.0, 0.0))),
+            tf_of(at, "odom", "base_link", (second * 0.1, 0.0, 0.0)),
             boolean(at, second % 7 == 0),
         ]
     return [*made, detections(T0 + start_s * S, ["cup"])]
@@ -509,7 +510,7 @@ def test_a_reply_names_the_damage_of_its_window_alone(tmp_path: Path) -> None:
     """A file with damage on both sides of a window is whole there."""
     made: list[Msg] = []
     for at in range(T0, T0 + 60 * S, S // 5):
-        moved = tf(at, transform(at, "map", "odom", (1.0, 0.0, 0.0)))
+        moved = tf_of(at, "map", "odom", (1.0, 0.0, 0.0))
         made += [odom(at, (at - T0) / S / 20), moved, detections(at, ["cup"])]
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", made, McapLayout(chunk_size=8000))
     for at in (T0 + 10 * S, T0 + 50 * S):

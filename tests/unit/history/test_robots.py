@@ -26,8 +26,7 @@ from tests.support.bags import (
     in_order,
     odom,
     text,
-    tf,
-    transform,
+    tf_of,
     write_db3,
     write_mcap,
 )
@@ -51,7 +50,7 @@ def record(bag_dir: Path, name: str, messages: list[Msg]) -> None:
 
 
 def mounted(parent: str, at: int = T0) -> Msg:
-    return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+    return tf_of(at, parent, "laser", (0.1, 0.0, 0.0), topic="/tf_static")
 
 
 MIXED = re.compile("as of several robots.*blue, red")

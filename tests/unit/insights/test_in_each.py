@@ -20,7 +20,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Sightings
 from ros2_memory.tools.arguments import _as_hours
 from ros2_memory.tools.replies import as_json
-from tests.support.bags import along_x, boolean, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import along_x, boolean, detections, odom, text, tf_of, write_mcap
 from tests.support.clocks import in_zone
 from tests.support.memories import asked, memory_of, remembered
 from tests.support.rooms import S, asked_of, draw, write
@@ -206,7 +206,7 @@ def holed(tmp_path_factory: pytest.TempPathFactory) -> Memory:
             for at in range(begin, begin + 10)
             for each in (
                 odom((T0 + at) * S, float(at)),
-                tf((T0 + at) * S, transform((T0 + at) * S, "odom", "base_link", (at, 0.0, 0.0))),
+                tf_of((T0 + at) * S, "odom", "base_link", (at, 0.0, 0.0)),
                 detections((T0 + at) * S, ["cup"]),
             )
         ]

@@ -32,8 +32,7 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
-    tf,
-    transform,
+    tf_of,
     write_mcap,
     write_splits,
 )
@@ -521,7 +520,7 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
 def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Path) -> None:
     """As after a restart, before the initial pose is known."""
     stood = along_x(BEGIN, 60)
-    placed = [tf(at(nth), transform(at(nth), "map", "odom", (7, 2, 0))) for nth in range(40, 60)]
+    placed = [tf_of(at(nth), "map", "odom", (7, 2, 0)) for nth in range(40, 60)]
     write_mcap(tmp_path / "bag.mcap", in_order([*stood, *placed]))
     reply = asked(memory_of(tmp_path), "recap", start=at(0) / S, end=at(59) / S)
     assert [event["text"] for event in reply["events"]] == ["stood at x 7.00, y 2.00"]

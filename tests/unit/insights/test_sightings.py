@@ -42,6 +42,7 @@ from tests.support.bags import (
     quaternion,
     text,
     tf,
+    tf_of,
     transform,
     write_mcap,
     write_splits,
@@ -236,7 +237,7 @@ def test_a_frame_that_was_renamed_is_that_of_the_window(tmp_path: Path) -> None:
 
 
 def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
-    moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
+    moved = tf_of(BEGIN, "map", "odom", (5.0, 0.0, 0.0))
     memory = remembered(tmp_path, [moved, odom(BEGIN, 1.0, 2.0)])
     place: JsonValue = {"x": 1.0, "y": 2.0, "frame_id": "odom"}
     near = partial(Sought, "/odom", "near_position")
@@ -341,7 +342,7 @@ def test_a_frame_among_transforms_of_others_is_seen_until_it_is_not_for_long(
     ]
     for second in (*range(20), *range(60, 80)):
         at = BEGIN + second * S + S // 20
-        messages.append(tf(at, transform(at, "odom", "tag_7", (1.0, 0.0, 0.0))))
+        messages.append(tf_of(at, "odom", "tag_7", (1.0, 0.0, 0.0)))
     memory = remembered(tmp_path, messages, recalls=recalls)
     seen = {"topic": "/tf", "condition_type": "contains", "value": "tag_7"}
     newest, oldest = asked(memory, "find_matches", **seen)["sightings"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import FLICKER_NS
 from ros2_memory.core.regions import Circle, Storey
 from ros2_memory.history.context import Memory
-from tests.support.bags import detected, odom, tf, transform, write_splits
+from tests.support.bags import detected, odom, tf_of, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.storeys import (
@@ -145,8 +145,8 @@ def test_transforms_to_the_map_have_heights(
 ) -> None:
     messages = []
     for at, (x, z) in zip(TIMES, WAY, strict=True):
-        own = tf(at, transform(at, "odom", "base_link", (x, 0.0, 0.0))) if of_body else odom(at, x)
-        messages += [tf(at, transform(at, "map", "odom", (0.0, 0.0, z))), own]
+        own = tf_of(at, "odom", "base_link", (x, 0.0, 0.0)) if of_body else odom(at, x)
+        messages += [tf_of(at, "map", "odom", (0.0, 0.0, z)), own]
     memory = with_places(remembered(tmp_path, messages, recalls=recalls), frame="map")
     for name in HOUSE:
         [row] = asked(memory, "visits", where=name)["visits"]

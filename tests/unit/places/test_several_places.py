@@ -23,17 +23,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import (
-    along_x,
-    boolean,
-    octets,
-    odom,
-    text,
-    tf,
-    transform,
-    write_mcap,
-    write_splits,
-)
+from tests.support.bags import along_x, boolean, octets, odom, text, tf_of, write_mcap, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
@@ -408,7 +398,7 @@ def test_a_path_by_transforms_is_whole_where_a_bag_reaches_from_1970_to_now(
 ) -> None:
     """The clock was set while it was recorded: of half a million hours two have messages."""
     times = [20 * S, *(MAP_BEGIN + n * S // 10 for n in range(300))]
-    poses = [tf(at, transform(at, "odom", "base_link", (1.0, 0, 0))) for at in times]
+    poses = [tf_of(at, "odom", "base_link", (1.0, 0, 0)) for at in times]
     memory = remembered(tmp_path, poses, recalls=recalls)
     # Each look at the clock takes 10 ms.
     call = Call(Deadline.after(20.0, partial(next, count(0.0, 0.01))))

@@ -30,6 +30,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     write_mcap,
     write_splits,
@@ -87,7 +88,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
     tmp_path: Path, *, in_map: bool
 ) -> None:
     twice = [each for begin in (0, 1000) for each in line((10, 0.0), (20, 0.5), begin=begin)]
-    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (0.5, 0.0, 0.0)), topic="/tf_static")
+    fixed = tf_of(BEGIN, "map", "odom", (0.5, 0.0, 0.0), topic="/tf_static")
     memory = remembering(tmp_path, [*[fixed] * in_map, *twice])
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert answer.frame_id == ("map" if in_map else "odom")
@@ -100,7 +101,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_unless_they_are_in_a_
 
 
 def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
-    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (50.0, 1.0, 0.0)), topic="/tf_static")
+    fixed = tf_of(BEGIN, "map", "odom", (50.0, 1.0, 0.0), topic="/tf_static")
     memory = remembering(tmp_path, [fixed, *line((10, 0.0), (20, 0.5))])
     pasted: dict[str, Any] = {"x": 0.0, "y": 0.0, "radius_m": 1.0}
     found = visits(memory, Call(), **pasted)
@@ -399,7 +400,7 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
     messages = []
     for nth in range(1200):
         at, x = BEGIN + nth * S // 10, 5.0 if 550 <= nth < 650 else 0.0
-        messages.append(tf(at, transform(at, "base_link", "arm", (0, 0, nth % 5))))
+        messages.append(tf_of(at, "base_link", "arm", (0, 0, nth % 5)))
         messages.append(tf(at + 5, transform(at, "odom", "base_link", (x, 0, 0)), topic="/own/tf"))
     write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, limits=QuerySettings(tf_topics=("/tf", "/own/tf")))
@@ -462,10 +463,7 @@ def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
     """It goes along its rail in two recordings; only transforms place it, in `world`."""
     for nth in range(2):
         times = [BEGIN + (1000 * nth + n) * S // 10 for n in range(100)]
-        moved = [
-            tf(at, transform(at, "world", "base_link", (n / 50, 0.0, 0.0)))
-            for n, at in enumerate(times)
-        ]
+        moved = [tf_of(at, "world", "base_link", (n / 50, 0.0, 0.0)) for n, at in enumerate(times)]
         write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", moved)
     memory = memory_of(tmp_path, limits=QuerySettings(map_frame=map_frame))
     reply = asked(memory, "visits", x=1.0, y=0.0, radius_m=0.2)

@@ -58,6 +58,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     typestore,
     write_mcap,
@@ -101,9 +102,7 @@ def splits(bag_dir: Path, minutes: Iterable[int]) -> None:
 def content_of_split(start: int, labels: tuple[str, ...] | None) -> bytes:
     begin = T0 + start * S
     times = range(begin, begin + 60 * S, S // 2)
-    messages: list[Msg] = [
-        tf(begin, transform(begin, "base_link", "camera", (0.1, 0, 0.3)), topic="/tf_static")
-    ]
+    messages: list[Msg] = [tf_of(begin, "base_link", "camera", (0.1, 0, 0.3), topic="/tf_static")]
     for at in times:
         messages.append(odom(at, (at - T0) / S / 4, 1.0))
         messages.append(boolean(at, (at - T0) // (30 * S) % 2 == 1))
@@ -643,7 +642,7 @@ def test_people_are_taken_out_whatever_names_them_unless_their_label_is_named(
             *(detections(at, (*PEOPLE, *THINGS)) for at in times),
             *(tf(at, *frames[: 1 + nth % 2]) for nth, at in enumerate(times)),
             tf(T0, *frames, topic="/tf_static"),
-            tf(T0, transform(T0, "map", "child", (0.1, 0, 0.3)), topic="/tf_static"),
+            tf_of(T0, "map", "child", (0.1, 0, 0.3), topic="/tf_static"),
             *(boolean(at, at % 2 == 0, topic="/face/is_seen") for at in times),
             *(
                 text(at, json.dumps(state), "/arm")

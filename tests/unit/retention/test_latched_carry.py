@@ -21,7 +21,7 @@ from ros2_memory.retention.latched_carry import (
 from ros2_memory.storage.base import REPEATED_NS, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf_of, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.fakes import broken, killed_at
 from tests.support.housekeepers import files_in, keeper_of, made_moment, size_of
@@ -36,12 +36,7 @@ LAYOUT = McapLayout(latched=frozenset({"/tf_static", DOCK}))
 
 
 def frame(at: int, child: str, x: float, *, received: int | None = None) -> Msg:
-    return tf(
-        at,
-        transform(at, "base_link", child, (x, 0.0, 0.0)),
-        topic="/tf_static",
-        log_time=received or at,
-    )
+    return tf_of(at, "base_link", child, (x, 0.0, 0.0), topic="/tf_static", log_time=received or at)
 
 
 def docked(at: int, where: str, *, received: int | None = None) -> Msg:

@@ -21,7 +21,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.saved_moments import LONGEST_WAIT_NS, Share
-from tests.support.bags import McapLayout, odom, tf, transform, write_mcap
+from tests.support.bags import McapLayout, odom, tf_of, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.fakes import broken, killed_at
@@ -307,7 +307,7 @@ def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept
     tmp_path: Path,
 ) -> None:
     for at, x in ((T0 - 100 * S, 0.1), (T0 + 100 * S, 0.2)):
-        mounted = tf(at, transform(at, "base_link", "laser", (x, 0, 0)), topic="/tf_static")
+        mounted = tf_of(at, "base_link", "laser", (x, 0, 0), topic="/tf_static")
         path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
         write_mcap(path, [odom(at, 0.0, 0.0), mounted])
     recording(tmp_path, A, 0)

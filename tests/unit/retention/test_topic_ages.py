@@ -26,7 +26,7 @@ from ros2_memory.retention import repair
 from ros2_memory.retention.topic_ages import PATIENCE_S, TopicAge, TopicCutter
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, odom, text, tf_of, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.fakes import broken, failing, killed_at
 from tests.support.housekeepers import HOUR, keeper_of, own_all
@@ -42,7 +42,7 @@ def split(bag_dir: Path, hour: int, *, name: str = "rec_A", first: int = 0) -> P
     """Ten seconds of a robot that drives and speaks, so many hours after `T0`."""
     begin = T0 + hour * HOUR
     messages: list[Msg] = [
-        tf(begin, transform(begin, "base_link", "camera", (0.1, 0, 0.3)), topic="/tf_static"),
+        tf_of(begin, "base_link", "camera", (0.1, 0, 0.3), topic="/tf_static"),
         *(odom(begin + n * S // 10, n / 10, 1.0) for n in range(100)),
         *(text(begin + first + n * S, f"word {n}", topic="/speech") for n in range(10)),
         *(boolean(begin + n * S, n % 2 == 0) for n in range(10)),

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import BagReader, Batch, Record
-from tests.support.bags import Msg, boolean, odom, text, tf, transform
+from tests.support.bags import Msg, boolean, odom, text, tf_of
 from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
 
@@ -124,7 +124,7 @@ def test_what_channels_declare_and_publish_times_are_kept(shelf: Shelf, tmp_path
     """Publish times where the format has them; a topic may have no message."""
     silent = [("/quiet", STRING), ("/still", BOOL)]
     messages = [
-        tf(1, transform(1, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
+        tf_of(1, "base_link", "laser", (0.1, 0.0, 0.2), topic="/tf_static"),
         odom(5, 0.0, 0.0, log_time=7),
         odom(6, 0.0, 0.0, log_time=9),
     ]

@@ -21,6 +21,7 @@ from tests.support.bags import (
     point,
     quaternion,
     tf,
+    tf_of,
     transform,
     write_mcap,
     write_splits,
@@ -139,7 +140,7 @@ def test_a_map_that_was_laid_out_anew_between_two_days_is_said_to_be(
 
     def day(name: str, begin: int, utm_x: float) -> None:
         at = (BEGIN + begin) * S
-        anchor = tf(at, transform(at, "map", frame, (utm_x, -5.32e6, 0.0)), topic="/tf_static")
+        anchor = tf_of(at, "map", frame, (utm_x, -5.32e6, 0.0), topic="/tf_static")
         seen = [anchor, *looked(begin, begin + 30, HERE, MUG, BOOK)]
         write_mcap(tmp_path / name / f"{name}_0.mcap", seen)
 

@@ -41,6 +41,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     tracked,
     transform,
     write_mcap,
@@ -80,7 +81,7 @@ def scene(
     px, py = turned(x - ox, y - oy, -turn)
     messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
     if in_map:
-        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, 0.0), turn)))
+        messages.append(tf_of(at, "map", "odom", (ox, oy, 0.0), turn))
     things = [(label, score, (*turned(tx - x, ty - y, -yaw), 0.7)) for label, tx, ty in seen]
     return [*messages, detected(at, things)]
 
@@ -260,7 +261,7 @@ def test_a_map_of_another_name_is_proposed_where_things_are_listed_for_each_run(
     for run in range(2):
         seen = looked(1000 * run, 1000 * run + 60, HERE, ("cup", 3.0, 0.0), in_map=False)
         begin = (BEGIN + 1000 * run) * S
-        mapped = tf(begin, transform(begin, "map_ned", "odom", (1.0 * run, 0.0, 0.0)))
+        mapped = tf_of(begin, "map_ned", "odom", (1.0 * run, 0.0, 0.0))
         write_splits(tmp_path / str(run), [mapped, *seen])
     assert "is a map, set data.map_frame=map_ned" in str(ask(tmp_path)["notes"])
 
@@ -1016,10 +1017,7 @@ def test_a_stamp_that_was_not_filled_in_is_no_time_also_where_time_begins_at_zer
 ) -> None:
     """Of a simulation: its first seconds agree with a stamp of 0."""
     drive = along_x(0, 60, mps=0.5, hz=10)
-    drive += [
-        tf(n * S // 10, transform(n * S // 10, "odom", "base_link", (n * 0.05, 0.0, 0.0)))
-        for n in range(600)
-    ]
+    drive += [tf_of(n * S // 10, "odom", "base_link", (n * 0.05, 0.0, 0.0)) for n in range(600)]
     for at in range(4, 8):
         seen = detections(0, ["cup"], at=(4.0 - 0.5 * at, 0.0, 0.0))
         drive.append(replace(seen, log_time=at * S))

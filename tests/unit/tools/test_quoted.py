@@ -17,8 +17,7 @@ from tests.support.bags import (
     log_entry,
     odom,
     text,
-    tf,
-    transform,
+    tf_of,
     write_mcap,
 )
 from tests.support.fleets import fleet_over, reply
@@ -91,11 +90,7 @@ def spoken_to(bag_dir: Path) -> Path:
     """A drive of 30 s with a stop, on which everything that can hold a text says the same."""
     messages = [odom(T0 + n * S // 10, min(n, 100) / 20, 0.0) for n in range(300)]
     messages += [
-        tf(
-            T0 + n * S // 10,
-            transform(T0 + n * S // 10, "odom", "base_link", (min(n, 100) / 20, 0, 0)),
-        )
-        for n in range(300)
+        tf_of(T0 + n * S // 10, "odom", "base_link", (min(n, 100) / 20, 0, 0)) for n in range(300)
     ]
     for n in range(30):
         at = T0 + n * S
@@ -187,7 +182,7 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
             setattr(part, name, ATTACK + name)
         messages += [
             pose,
-            tf(at, transform(at, ATTACK + "frame_id", ATTACK + "child", (n / 10, 0, 0))),
+            tf_of(at, ATTACK + "frame_id", ATTACK + "child", (n / 10, 0, 0)),
         ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     found = asked(memory_of(tmp_path), tool, **given)

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import Memory
-from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
+from tests.support.bags import boolean, odom, text, tf_of, write_mcap
 from tests.support.clocks import SettableClock, in_zone
 from tests.support.memories import asked, memory_of
 from tests.support.program import Program, exits
@@ -94,7 +94,7 @@ def write_drive(folder: Path, begin_s: int) -> None:
     for tenth in range(200):
         at = begin_s * S + tenth * S // 10 + OFFSET
         messages.append(odom(at, tenth / 10, 0.0, vx=1.0))
-        messages.append(tf(at, transform(at, "odom", "base", (tenth / 10, 0.0, 0.0))))
+        messages.append(tf_of(at, "odom", "base", (tenth / 10, 0.0, 0.0)))
         if tenth % 10 == 0:
             messages.append(boolean(at, tenth % 40 == 0, topic="/flag"))
     write_mcap(folder / "rec" / "rec_0.mcap", messages)

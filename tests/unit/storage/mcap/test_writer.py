@@ -15,7 +15,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf_of, write_mcap
 from tests.support.examples import examples
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
@@ -30,7 +30,7 @@ CHANNEL = Channel("/a", "cdr", Schema("std_msgs/msg/String"))
 def messages(count: int = 40) -> list[Msg]:
     times = [T0 + n * S // 10 for n in range(count)]
     return [
-        tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
+        tf_of(T0, "base_link", "laser", (0.1, 0.0, 0.2), topic="/tf_static"),
         *(odom(time, 1.0, 2.0, log_time=time + 70) for time in times),
         *(text(T0 + n * S, f"line {n}") for n in range(3)),
     ]
