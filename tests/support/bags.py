@@ -427,6 +427,23 @@ def octets(ns: int, held: Iterable[int], topic: str = "/octets") -> Msg:
     return Msg(topic, "std_msgs/msg/UInt8MultiArray", ns, body)
 
 
+def fix(
+    ns: int, latitude: float = 48.0, longitude: float = 11.0, altitude: float = 0.0, status: int = 0
+) -> Msg:
+    """What a receiver of satellites says: in degrees and metres; the status -1 is no fix."""
+    body = make(
+        "sensor_msgs/msg/NavSatFix",
+        header=header(ns, "gps"),
+        status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+    return Msg("/fix", "sensor_msgs/msg/NavSatFix", ns, body)
+
+
 def log_entry(ns: int, level: int, name: str, message: str) -> Msg:
     """An entry of /rosout: 20 INFO, 30 WARN, 40 ERROR."""
     body = make(

@@ -16,6 +16,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.scan import read_until_late
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
+from tests.support import bags
 from tests.support.bags import (
     Msg,
     along_x,
@@ -65,17 +66,7 @@ def vehicle(ns: int, x: float, topic: str = VEHICLE) -> Msg:
 
 
 def fix(ns: int, north: float, east: float = 0.0, status: int = 0) -> Msg:
-    body = make(
-        "sensor_msgs/msg/NavSatFix",
-        header=header(ns, "gps"),
-        status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
-        latitude=48.1234567 + north,
-        longitude=11.7654321 + east,
-        altitude=519.5,
-        position_covariance=np.zeros(9),
-        position_covariance_type=0,
-    )
-    return Msg("/fix", "sensor_msgs/msg/NavSatFix", ns, body)
+    return bags.fix(ns, 48.1234567 + north, 11.7654321 + east, 519.5, status)
 
 
 FIXES = [fix(T0 + n * S, n * 1e-5) for n in range(60)]

@@ -6,7 +6,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
@@ -19,7 +18,7 @@ from ros2_memory.results import Bins
 from tests.support.bags import (
     Msg,
     battery,
-    header,
+    fix,
     make,
     octets,
     odom,
@@ -138,24 +137,9 @@ def test_no_number_is_lost_where_time_runs_out_while_a_table_is_counted(tmp_path
     assert len(sizes_counted(memory, range(1, 40, 3))) > 1
 
 
-def fix(at: int, altitude: float) -> Msg:
-    kind = "sensor_msgs/msg/NavSatFix"
-    body = make(
-        kind,
-        header=header(at, "gps"),
-        status=make("sensor_msgs/msg/NavSatStatus", status=0, service=1),
-        latitude=48.0,
-        longitude=11.0,
-        altitude=altitude,
-        position_covariance=np.zeros(9),
-        position_covariance_type=0,
-    )
-    return Msg("/fix", kind, at, body)
-
-
 def test_heights_of_a_receiver_are_counted_as_far_as_there_is_time(tmp_path: Path) -> None:
     """The search for messages without a fix leaves the time to the numbers."""
-    write(tmp_path, [fix(BEGIN + n * 10 * S, float(n)) for n in range(200)])
+    write(tmp_path, [fix(BEGIN + n * 10 * S, altitude=float(n)) for n in range(200)])
     span = TimeRange(BEGIN / S, BEGIN / S + HOUR)
     least = set()
     for looks in range(1, 33):

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import pytest
 from mcap.writer import Writer
 
@@ -33,6 +32,7 @@ from tests.support.bags import (
     battery,
     boolean,
     detections,
+    fix,
     goals,
     header,
     make,
@@ -109,20 +109,9 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
 def test_a_constant_names_the_number_of_a_field_that_replies_call_otherwise(
     tmp_path: Path, field: str
 ) -> None:
-    def fix(second: int, status: int) -> Msg:
-        body = make(
-            "sensor_msgs/msg/NavSatFix",
-            header=header(T0, "gps"),
-            status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
-            latitude=48.4,
-            longitude=11.7,
-            altitude=447.0,
-            position_covariance=np.zeros(9),
-            position_covariance_type=0,
-        )
-        return Msg("/fix", "sensor_msgs/msg/NavSatFix", T0 + second * NS_PER_S, body)
-
-    memory = remembered(tmp_path, [fix(0, 2), fix(1, -1), fix(2, 0)])
+    statuses = enumerate((2, -1, 0))
+    fixes = [fix(T0 + second * NS_PER_S, status=status) for second, status in statuses]
+    memory = remembered(tmp_path, fixes)
 
     assert at(last(memory, "equals", "STATUS_NO_FIX", "/fix", field=field)) == 1
     assert at(last(memory, "equals", "STATUS_GBAS_FIX", "/fix", field=field)) == 0
@@ -139,9 +128,9 @@ def test_a_constant_may_be_of_the_first_or_of_the_last_definition_of_a_type(
         def fill(writer: Writer, day: int = day, definition: str = definition) -> None:
             schema = writer.register_schema("gps_msgs/msg/Fix", "ros2msg", definition.encode())
             channel = writer.register_channel("/fix", "cdr", schema)
-            for second, fix in enumerate([6, 1, 6]):
+            for second, each in enumerate([6, 1, 6]):
                 at = T0 + (1000 * day + second) * NS_PER_S
-                writer.add_message(channel, at, b"\0\1\0\0" + bytes([fix]), at)
+                writer.add_message(channel, at, b"\0\1\0\0" + bytes([each]), at)
 
         raw_mcap(tmp_path / f"day_{day}" / f"day_{day}_0.mcap", fill, profile="ros2")
     memory = memory_of(tmp_path)
