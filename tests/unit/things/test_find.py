@@ -631,24 +631,21 @@ def test_what_a_detector_with_other_words_may_call_a_thing_is_said(
 
 
 @each_way
-def test_what_a_user_asked_for_was_not_seen(tmp_path: Path, recalls: bool) -> None:
+def test_what_a_user_asks_for_and_a_detector_is_to_look_for_was_not_seen(
+    tmp_path: Path, recalls: bool
+) -> None:
     """A command has its object in a text of JSON, beside what is to be done with it."""
     key_value = "diagnostic_msgs/msg/KeyValue"
     command = make(key_value, key="find_object", value='{"object": "glasses"}')
     asked_for = Msg("/command", key_value, (BEGIN + 5) * S, command)
-    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), asked_for])
-    memory = memory_of(tmp_path, recalls=recalls)
-    assert "glasses" not in str(asked(memory, "find_things"))
-    assert "glasses in view" not in str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
-
-
-@each_way
-def test_what_a_detector_is_told_to_look_for_was_not_seen(tmp_path: Path, recalls: bool) -> None:
     prompts = text((BEGIN + 5) * S, '{"classes": ["cup", "bottle"]}', topic="/prompts")
-    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), prompts])
+    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), asked_for, prompts])
     memory = memory_of(tmp_path, recalls=recalls)
-    assert "bottle" not in str(asked(memory, "find_things"))
-    assert "bottle in view" not in str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
+    found = str(asked(memory, "find_things"))
+    told = str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
+    for label in ("glasses", "bottle"):
+        assert label not in found
+        assert f"{label} in view" not in told
 
 
 @pytest.mark.parametrize("label", ["forklift", "Fork_Lift", "forklifts"])
