@@ -23,7 +23,7 @@ from tests.support.column_worlds import store_file
 from tests.support.housekeepers import recorded_before, state
 from tests.support.processes import until
 from tests.support.robot_run import T0, ask_everything, write_run
-from tests.support.served import Served, serving
+from tests.support.served import Served, env_without_ours, serving
 
 COMMANDS = {
     "info": ["info"],
@@ -72,9 +72,8 @@ def env(tmp_path: Path) -> dict[str, str]:
     ros2 = programs / "ros2"
     ros2.write_text('#!/bin/sh\nmkdir -p "$ROS_LOG_DIR" && date > "$ROS_LOG_DIR/ros2.log"\n')
     ros2.chmod(0o755)
-    kept = {name: text for name, text in os.environ.items() if not name.startswith("MEMORY_")}
     path = f"{programs}:{os.environ['PATH']}"
-    return {**kept, "PATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    return {**env_without_ours(), "PATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
 
 
 def run(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:

@@ -32,6 +32,7 @@ from tests.support.documented_history import START_S, write_history
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import own_all
 from tests.support.memories import ROOT
+from tests.support.served import env_without_ours
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = Path(sys.executable).parent
@@ -128,8 +129,7 @@ def home(tmp_path: Path, history: Path, commands: Path) -> Path:
 
 
 def environment(home: Path) -> dict[str, str]:
-    ours = ("MEMORY_", "MCP_", "ROS_")
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
+    kept = env_without_ours()
     programs = (str(home / "commands"), str(PROGRAMS), kept.get("PATH", ""))
     return {**kept, "HOME": str(home), "PATH": os.pathsep.join(programs)}
 

@@ -21,11 +21,15 @@ def command(*overrides: str) -> list[str]:
     return [*PROGRAM, *overrides]
 
 
-def environment(bag_dir: Path, **more: str) -> dict[str, str]:
+def env_without_ours() -> dict[str, str]:
     """This test's environment, without the user's own settings."""
     ours = ("MEMORY_", "MCP_", "ROS_")
-    kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
-    return kept | {"MEMORY_BAG_DIR": str(bag_dir)} | more
+    return {name: text for name, text in os.environ.items() if not name.startswith(ours)}
+
+
+def environment(bag_dir: Path, **more: str) -> dict[str, str]:
+    """The same, with a bag directory."""
+    return env_without_ours() | {"MEMORY_BAG_DIR": str(bag_dir)} | more
 
 
 @dataclass
