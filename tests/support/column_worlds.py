@@ -1,7 +1,7 @@
 """Memories with a store of columns, and what they scan beside what plain reading finds."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -47,13 +47,12 @@ class World:
         bag_dir: Path,
         *,
         limits: StoreLimits | None = None,
-        file: Path | None = None,
+        files: Sequence[Path] | None = None,
         clock: Clock | None = None,
     ) -> "World":
         reader = BagDirReader(Rosbag2Reader(), bag_dir)
         memory = memory_of(bag_dir, clock=clock, reader=reader)
-        paths = [file or store_file(bag_dir)]
-        store = ColumnStore(paths, reader.definition)
+        store = ColumnStore([store_file(bag_dir)] if files is None else files, reader.definition)
         memory = replace(memory, scanner=Scanner(store, bag_dir))
         assert memory.scanner is not None
         filling = Filling(memory.scanner, reader, bag_dir, memory.clock, limits or StoreLimits())

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.expressions import AlwaysTrue
 
-from ros2_memory.bag_dir.layout import LIST_FILE, OWN_FOLDER
+from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
@@ -24,12 +23,12 @@ from ros2_memory.lake.select import Select
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.upkeep import Tombstone
 from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation, location_of
-from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.column_worlds import World
 from tests.support.fleets import NOW, START_S
-from tests.support.memories import extractor, memory_of
+from tests.support.memories import extractor
 
 LATER = (START_S + 86_400) * NS_PER_S
 
@@ -56,13 +55,8 @@ def robot_bags(
 ) -> RobotBags:
     """A robot whose bags are shipped, with a store: its own, or at a path of `cache`."""
     bag_dir.mkdir(parents=True, exist_ok=True)
-    memory = memory_of(bag_dir, clock=clock)
-    paths = [bag_dir / OWN_FOLDER / FILE] if cache is None else cache
-    store = ColumnStore(paths, memory.reader.definition)
-    memory = replace(memory, scanner=Scanner(store, bag_dir))
-    limits = limits or StoreLimits()
-    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits)
-    return RobotBags(name, memory, McapReader(), "test", messages, filling)
+    world = World.of(bag_dir, limits=limits, files=cache, clock=clock)
+    return RobotBags(name, world.memory, McapReader(), "test", messages, world.filling)
 
 
 def location(folder: Path) -> LakeLocation:
@@ -96,9 +90,12 @@ def ship(folder: Path, robots: Sequence[RobotBags], **how: Any) -> Shipped:
         return shipper.run()
 
 
-def ship_from(folder: Path, *names: str) -> Shipped:
-    """One pass over robots in a folder, into its lake."""
-    return ship(folder / "lake", [robot_bags(name, folder / name) for name in names or ("hall",)])
+def ship_from(
+    folder: Path, *names: str, messages: Sequence[str] = ("/chatter",), most_bags: int = 2
+) -> Shipped:
+    """One pass over robots in a folder, `hall` unless others are named, into its lake."""
+    robots = [robot_bags(each, folder / each, messages=messages) for each in names or ("hall",)]
+    return ship(folder / "lake", robots, most_bags=most_bags)
 
 
 @pytest.fixture
@@ -163,10 +160,7 @@ def store_columns(memory: Memory) -> Filling:
     bag_dir, limits = memory.index.bag_dir, StoreLimits(max_share=1.0)
     filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits)
     timeline = memory.index.snapshot().timeline
-    for batch in filling.batches(timeline):
-        assert filling.fill(batch, timeline) == len(batch.bags)
-    make_fragments(memory, filling.whole_since())
-    filling.thin()
+    assert World(bag_dir, memory, filling).fill() == len(timeline.bags)
     assert filling.progress(timeline).stored == len(timeline.bags)
     return filling
 

@@ -106,19 +106,19 @@ def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(
     for number in range(40):
         write_bag(bag_dir, number, rows=150)
     cache = tmp_path / "cache" / "columns.sqlite"
-    whole = World.of(bag_dir, file=cache)
+    whole = World.of(bag_dir, files=[cache])
     empty = whole.store.used_bytes()
     whole.fill()
     limits = StoreLimits(max_bytes=empty + (whole.store.used_bytes() - empty) // 2)
     whole.store.close()
-    world = World.of(bag_dir, file=cache, limits=limits)
+    world = World.of(bag_dir, files=[cache], limits=limits)
     world.fill()
     assert world.store.used_bytes() <= limits.max_bytes
     before = world.stored()
     assert before == {f"rec/rec_{number}.mcap" for number in range(40 - len(before), 40)}
     assert 10 <= len(before) < 40
     # Another process, which has not seen what was deleted.
-    again = World.of(bag_dir, file=cache, limits=limits)
+    again = World.of(bag_dir, files=[cache], limits=limits)
     assert again.fill() == 0
     for number in range(40, 60):
         write_bag(bag_dir, number, rows=150)
@@ -134,7 +134,7 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
     bag_dir = tmp_path / "bags"
     write_bag(bag_dir, 0, rows=900)
     limits = StoreLimits(max_bytes=20_000)
-    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite", limits=limits)
+    world = World.of(bag_dir, files=[tmp_path / "cache" / "columns.sqlite"], limits=limits)
     assert world.fill() == 0
     assert check_all(world) == 901
 
@@ -148,7 +148,7 @@ def test_a_bag_in_which_the_clock_was_set_ahead_by_years_fits_into_a_cache_folde
     messages = [odom(at + n * S, n / 10, 0.0) for at in (T0 - years, T0) for n in range(60)]
     path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
     os.utime(path, ns=(T0, T0))
-    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite", limits=StoreLimits())
+    world = World.of(bag_dir, files=[tmp_path / "cache" / "columns.sqlite"], limits=StoreLimits())
     world.fill()
     assert world.stored() == {"rec/rec_0.mcap"}
     assert times(world, "/odom") == times(world.unstored(), "/odom")

@@ -34,6 +34,7 @@ from tests.support.bags import (
     odom,
     text,
     tf,
+    tf_of,
     transform,
     write_mcap,
 )
@@ -71,7 +72,7 @@ def write_all_that_is_derived(bag_dir: Path) -> None:
     for n in range(120):
         at = T0 + n * S // 2
         x = min(max(n - 20, 0), 60) / 20
-        messages += [odom(at, x, 0.1), tf(at, transform(at, "map", "odom", (1.0, 0.0, 0.0)))]
+        messages += [odom(at, x, 0.1), tf_of(at, "map", "odom", (1.0, 0.0, 0.0))]
         messages += [boolean(at + 1, data=n % 40 < 9), battery(at + 2, 0.3 - n / 500)]
         messages += [command(at + 3, 0.1 if 20 < n < 80 else 0.0)]
         messages += [detections(at + 4, ["cup"] if n % 30 < 9 else [], at=(1.0, 2.0, 0.5))]
@@ -200,7 +201,7 @@ def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_p
     scanner = Scanner(ColumnStore([refused, cache], world.memory.reader.definition), world.bag_dir)
     assert scanner.store is not None
     assert scanner.store.path == cache
-    in_memory = World.of(bag_dir, file=refused)
+    in_memory = World.of(bag_dir, files=[refused])
     assert in_memory.store.path is None
     assert in_memory.fill() == 4
     assert check_all(in_memory) == 4 * 24

@@ -26,7 +26,15 @@ from ros2_memory.lake.warehouse import Days, LakeFile
 from tests.support.bags import Msg, battery, boolean, detections, text, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
-from tests.support.lakes import lake_in, lake_robot, lake_robots, location, robot_bags, ship
+from tests.support.lakes import (
+    lake_in,
+    lake_robot,
+    lake_robots,
+    location,
+    robot_bags,
+    ship,
+    ship_from,
+)
 
 DAY_S = 86_400
 
@@ -254,8 +262,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
         messages: list[Msg] = [detections(at, [seen]), text(at + NS_PER_S, seen)]
         if seen == "mug":
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
-        write_mcap(folder / "bags" / "rec" / f"rec_{7 - ago}.mcap", messages)
-    ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
+        write_mcap(folder / "hall" / "rec" / f"rec_{7 - ago}.mcap", messages)
+    ship_from(folder, most_bags=9)
     memory = lake_robot(folder / "lake", days=1, most_bags=1)
     return Robot("hall", memory, in_lake=True)
 
@@ -337,9 +345,9 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> Robot:
             messages = [text(at, "ouch"), *said, *messages]
         if ago == 101:
             messages.insert(0, text(at, "the map", "/map_name"))
-        write_mcap(folder / "bags" / f"rec_{ago}" / f"rec_{ago}_0.mcap", messages)
+        write_mcap(folder / "hall" / f"rec_{ago}" / f"rec_{ago}_0.mcap", messages)
     topics = ("/chatter", "/dock", "/bumper", "/battery_state", "/map_name")
-    ship(folder / "lake", [robot_bags("hall", folder / "bags", messages=topics)], most_bags=9)
+    ship_from(folder, messages=topics, most_bags=9)
     memory = lake_robot(folder / "lake", days=1, most_bags=1)
     return Robot("hall", memory, in_lake=True)
 

@@ -21,19 +21,9 @@ from ros2_memory.history.detections import Detected, DetectionRows
 from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.tables import NAMESPACE, TABLES, bags_condition, open_tables
 from ros2_memory.lake.warehouse import LakeFile, LakeLocation
-from tests.support.bags import (
-    Msg,
-    along_x,
-    battery,
-    detections,
-    make,
-    text,
-    tf,
-    transform,
-    write_mcap,
-)
+from tests.support.bags import Msg, along_x, battery, detections, make, text, tf_of, write_mcap
 from tests.support.fleets import NOW, START_S
-from tests.support.lakes import lake_in, lake_rows, robot_bags, ship
+from tests.support.lakes import lake_in, lake_rows, robot_bags, ship, ship_from
 from tests.support.memories import memory_of
 from tests.support.unlike_robots import ROBOTS
 
@@ -122,8 +112,8 @@ def test_messages_of_one_time_have_their_own_numbers_beside_one_that_cannot_be_d
 
     spoiled = replace(seen(2, "-"), body=b"\x00\x01\x00\x00\xff")
     messages = [seen(1, "ax"), seen(1, "b"), spoiled, seen(2, "c"), seen(2, ""), seen(3, "e")]
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*messages, battery(NOW, math.nan)])
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=["/battery_state"])])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [*messages, battery(NOW, math.nan)])
+    ship_from(tmp_path, messages=["/battery_state"])
     found = lake_rows(tmp_path / "lake", "sightings")
     numbered = [(0, "a"), (0, "x"), (1, "b"), (3, "c"), (5, "e")]
     assert sorted((row["message"], row["label"]) for row in found) == numbered
@@ -145,8 +135,8 @@ def test_numbers_of_messages_of_two_types_on_one_topic_are_those_of_their_places
             detections(at * NS_PER_S + 1, ["cup"], topic=topic),
         )
     ]
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", both)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=[topic])])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", both)
+    ship_from(tmp_path, messages=[topic])
     whole = {row["message"]: row["type"] for row in lake_rows(tmp_path / "lake", "messages")}
     assert whole == {nth: message.type for nth, message in enumerate(both)}
     seen = {row["message"]: row["type"] for row in lake_rows(tmp_path / "lake", "sightings")}
@@ -159,8 +149,8 @@ def test_messages_that_cannot_be_decoded_are_counted_also_where_nothing_was_seen
     spoiled = [
         replace(detections(at * NS_PER_S, ["cup"]), body=b"\x00\x01\x00\x00\xff") for at in range(4)
     ]
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*spoiled, detections(NOW, [])])
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [*spoiled, detections(NOW, [])])
+    ship_from(tmp_path)
     [row] = lake_rows(tmp_path / "lake", "bags")
     assert (row["undecodable"], row["detections"]) == (4, 0)
 
@@ -172,7 +162,7 @@ def test_a_tie_and_a_message_that_cannot_be_decoded_cost_no_read_for_each_other_
     seen = [detections((START_S + at) * NS_PER_S, ["cup"]) for at in range(40)]
     seen[10] = replace(seen[10], log_time=seen[9].log_time)
     seen[20] = replace(seen[20], body=seen[20].payload[:40])
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", seen)
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", seen)
     reads, read = [], DetectionRows.read
 
     def counted(self: DetectionRows, rows: Rows) -> Detected:
@@ -180,7 +170,7 @@ def test_a_tie_and_a_message_that_cannot_be_decoded_cost_no_read_for_each_other_
         return read(self, rows)
 
     monkeypatch.setattr(DetectionRows, "read", counted)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
+    ship_from(tmp_path)
     numbers = sorted(row["message"] for row in lake_rows(tmp_path / "lake", "sightings"))
     assert numbers == [*range(20), *range(21, 40)]
     assert len(reads) < 10
@@ -214,8 +204,8 @@ def test_a_pose_that_cannot_be_decoded_costs_its_bag_alone_the_poses(
     driven[torn] = replace(driven[torn], body=driven[torn].payload[:40])
     for nth in range(4):
         own = driven[20 * nth : 20 * nth + 20]
-        write_mcap(tmp_path / "bags" / "rec" / f"rec_{nth}.mcap", own)
-    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")], most_bags=4).bags == 4
+        write_mcap(tmp_path / "hall" / "rec" / f"rec_{nth}.mcap", own)
+    assert ship_from(tmp_path, most_bags=4).bags == 4
     rows = sorted(lake_rows(tmp_path / "lake", "bags"), key=lambda row: row["bag_id"])
     assert [(row["poses"], row["distance_m"]) for row in rows] == [
         (None, None) if nth == spoiled else (20, 9.5) for nth in range(4)
@@ -228,7 +218,7 @@ def test_the_metres_of_a_robot_that_transforms_alone_place_are_in_the_lake(tmp_p
     for nth in range(2):
         moves = [begin + (20 * nth * 10 + n) * NS_PER_S // 10 for n in range(200)]
         rail = [(at, min(n, 60) * 0.02) for n, at in enumerate(moves)]
-        moved = [tf(at, transform(at, "world", "base_link", (x, 0.0, 0.0))) for at, x in rail]
+        moved = [tf_of(at, "world", "base_link", (x, 0.0, 0.0)) for at, x in rail]
         write_mcap(bags / f"rec{nth}" / f"rec{nth}_0.mcap", moved)
     assert ship(tmp_path / "lake", [robot_bags("arm", bags)]).bags == 2
     for row in lake_rows(tmp_path / "lake", "bags"):
@@ -246,9 +236,9 @@ def test_bags_beside_one_whose_poses_have_no_position_are_shipped(
     begin = START_S * NS_PER_S
     driven = along_x(begin, 10, mps=0.5, hz=5)
     said = [text(begin + (n - earlier_s) * NS_PER_S + 7, "x", "/odom") for n in range(10)]
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", driven)
-    write_mcap(tmp_path / "bags" / "other" / "other_0.mcap", said)
-    shipped = ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", driven)
+    write_mcap(tmp_path / "hall" / "other" / "other_0.mcap", said)
+    shipped = ship_from(tmp_path)
     assert (shipped.bags, shipped.problems) == (2, [])
     rows = lake_rows(tmp_path / "lake", "bags")
     assert {row["recording"]: row["poses"] for row in rows} == {"rec": 50, "other": None}
@@ -263,10 +253,10 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     image = [Msg("/camera", "sensor_msgs/msg/Image", nth, noise(9)) for nth in (1, 2, 3)]
     scans = [Msg("/scan", "sensor_msgs/msg/LaserScan", nth, noise(2_000)) for nth in range(1, 30)]
     large_once = Msg("/map", "nav_msgs/msg/OccupancyGrid", 1, noise(9_000))
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*image, *scans, large_once])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [*image, *scans, large_once])
 
     def whole(name: str, *messages: str) -> set[str]:
-        ship(tmp_path / name, [robot_bags("hall", tmp_path / "bags", messages=messages)])
+        ship(tmp_path / name, [robot_bags("hall", tmp_path / "hall", messages=messages)])
         rows = lake_rows(tmp_path / name, "channels")
         counts = {row["topic"]: row["messages"] for row in rows}
         assert counts == {"/camera": 3, "/map": 1, "/scan": 29}
@@ -291,8 +281,8 @@ def test_values_are_json_also_of_ranges_that_are_not_finite(tmp_path: Path) -> N
         data=np.array([1.0, math.inf, math.nan]),
     )
     message = Msg("/ranges", "std_msgs/msg/Float64MultiArray", NOW, ranges)
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [message])
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=["/ranges"])])
+    write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [message])
+    ship_from(tmp_path, messages=["/ranges"])
     [row] = lake_rows(tmp_path / "lake", "messages")
     assert json.loads(row["value"], parse_constant=pytest.fail)["data"] == [1.0, None, None]
 
