@@ -108,8 +108,8 @@ class _Asker:
     def _of(self, text: str, spans: Sequence[Span]) -> list[Span]:
         return [each for each in spans if each.text == text]
 
-    def _some_task(self, least: int = 2) -> str:
-        names = [name for name in USED if len(self._of(name, self._tasks)) >= least]
+    def _some_task(self) -> str:
+        names = [name for name in USED if len(self._of(name, self._tasks)) >= 2]
         return self._draw.choice(names)
 
     def _task_of_day(self) -> tuple[int, str]:

@@ -84,7 +84,7 @@ def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[
 
 
 @contextmanager
-def load(running: Running, count: int, clients: int = 3) -> Iterator[list[str]]:
+def load(running: Running, count: int) -> Iterator[list[str]]:
     """Clients that ask without pause; gives what they were answered, while it grows."""
     over = threading.Event()
     answered: list[str] = []
@@ -99,7 +99,7 @@ def load(running: Running, count: int, clients: int = 3) -> Iterator[list[str]]:
                 continue
             return
 
-    threads = [threading.Thread(target=client, args=(3 * nth,)) for nth in range(clients)]
+    threads = [threading.Thread(target=client, args=(3 * nth,)) for nth in range(3)]
     for thread in threads:
         thread.start()
     try:

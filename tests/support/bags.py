@@ -476,16 +476,14 @@ def diagnostics(ns: int, **levels: tuple[int, str]) -> Msg:
     return Msg("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ns, body)
 
 
-def tracked(
-    ns: int, objects: Sequence[tuple[Mapping[int, float], float, float]], frame_id: str = "map"
-) -> Msg:
+def tracked(ns: int, objects: Sequence[tuple[Mapping[int, float], float, float]]) -> Msg:
     """TrackedObjects of Autoware: the probability of each class, x and y of each object."""
     package = "autoware_perception_msgs/msg"
     point = partial(make, "geometry_msgs/msg/Point", z=0.0)
     turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     body = make(
         f"{package}/TrackedObjects",
-        header=header(ns, frame_id),
+        header=header(ns, "map"),
         objects=[
             make(
                 f"{package}/TrackedObject",

@@ -50,9 +50,9 @@ def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
     write_splits(folder.parent, messages, split_s, folder.name)
 
 
-def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
+def arrivals(memory: Memory, x: float) -> list[float]:
     """Arrivals in whole seconds after T0, newest first."""
-    found = visits(memory, Call(), x, 0.0, radius_m=radius)
+    found = visits(memory, Call(), x, 0.0, radius_m=0.3)
     assert found.frame_id == "map"
     return [round(((each.arrived or 0) - T0) / S, 1) for each in found.visits]
 

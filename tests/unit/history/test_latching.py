@@ -40,9 +40,9 @@ def drive(start: int, stop: int) -> list[Msg]:
     return [odom(at) for at in range(start, stop, S)]
 
 
-def every(period_s: float, seconds: float, topic: str, begin: int = T0) -> list[Msg]:
+def every(period_s: float, seconds: float, topic: str) -> list[Msg]:
     count = int(seconds / period_s)
-    return [text(begin + round(n * period_s * S), str(n), topic) for n in range(count)]
+    return [text(T0 + round(n * period_s * S), str(n), topic) for n in range(count)]
 
 
 def record(bag_dir: Path, messages: list[Msg]) -> None:

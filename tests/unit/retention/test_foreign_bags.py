@@ -56,10 +56,10 @@ def careful(bag_dir: Path, **limits: Any) -> Housekeeping:
     return house_of(bag_dir, keeps_foreign=True, **limits)
 
 
-def foreign(bag_dir: Path, *names: str, start: int = -86_400) -> list[Path]:
+def foreign(bag_dir: Path, *names: str) -> list[Path]:
     """Bags of another program, older than any of the recorder's."""
     return [
-        write_mcap(bag_dir / name, [odom(T0 + (start + n) * S, 1.0, 2.0) for n in range(20)])
+        write_mcap(bag_dir / name, [odom(T0 + (n - 86_400) * S, 1.0, 2.0) for n in range(20)])
         for name in names
     ]
 

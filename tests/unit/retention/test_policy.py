@@ -50,13 +50,8 @@ def bytes_of(bags: Iterable[StoredBag], *others: StoredFile) -> int:
     return sum(sizes((*others, *(file for bag in bags for file in bag.files))).values())
 
 
-def contents(
-    *bags: StoredBag,
-    now: int = NOW,
-    other_bytes: int = 0,
-    free_bytes: int | None = None,
-) -> DirContents:
-    return DirContents(bags, now, other_bytes, free_bytes, synchronised=True)
+def contents(*bags: StoredBag, now: int = NOW) -> DirContents:
+    return DirContents(bags, now, synchronised=True)
 
 
 def expired(contents: DirContents, limits: RetentionLimits) -> tuple[StoredBag, ...]:

@@ -22,16 +22,11 @@ T0_S = 1_790_000_000.0
 FILE = ".episodic/recorded.jsonl"
 
 
-def recorded(
-    time: RecordedTime, name: str, seconds: int, *, since_s: float = 0.0, lead_s: float = T0_S
-) -> float:
-    """Has one recording grow every second; the monotonic time at its end.
-
-    The wall clock is so far ahead of the monotonic one.
-    """
+def recorded(time: RecordedTime, name: str, seconds: int, *, since_s: float = 0.0) -> float:
+    """Has one recording grow every second; the monotonic time at its end."""
     for second in range(seconds + 1):
         at_s = since_s + second
-        time.note([name], round(since_s) + second, at_s, ns_from_unix(lead_s + at_s))
+        time.note([name], round(since_s) + second, at_s, ns_from_unix(T0_S + at_s))
     return since_s + seconds
 
 

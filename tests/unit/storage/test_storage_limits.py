@@ -91,8 +91,8 @@ def little_memory(most: int) -> Iterator[None]:
     assert peak < most
 
 
-def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
-    path = folder / name
+def bag(folder: Path, *records: Piece) -> Path:
+    path = folder / "run/run_0.mcap"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(without_summary([header(), *records]))
     return path

@@ -112,9 +112,9 @@ def berlin() -> Iterator[None]:
         yield
 
 
-def utc(seconds: int, decimals: str = "") -> str:
+def utc(seconds: int) -> str:
     """The second so many seconds after `T0`."""
-    return f"{datetime.fromtimestamp(T0 + seconds, UTC):%Y-%m-%dT%H:%M:%S}{decimals}Z"
+    return f"{datetime.fromtimestamp(T0 + seconds, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
 
 def test_a_window_ends_where_its_end_begins_unless_it_starts_there(
