@@ -21,6 +21,7 @@ from ros2_memory.core.arrays import (
     Groups,
     Ints,
     begins_of,
+    distinct_rows,
     in_ranges,
     narrowed,
     range_numbers,
@@ -347,17 +348,18 @@ class Estimate:
     def _side_by_side_of(self, rows: Ints) -> int:
         """Returns the median number of things side by side in the newest slices of some spots.
 
-        A slice counts the spots that it saw at least half as often as the one it saw most. Only
-        spots seen three times in their slice count, or as often as a slow detector sees any.
+        Of a slice each detector counts the spots that it saw at least half as often as the one it
+        saw most. Only spots seen three times in their slice count, or as often as a slow detector
+        sees any.
         """
         counts = self.counts[rows]
         is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))
         rows, counts = rows[is_often], counts[is_often]
-        slices, together = (self.spots[rows, name] for name in (Spot.SLICE, Spot.TOGETHER))
-        by = Groups.of(np.unique(slices, return_inverse=True)[1])
+        spots = self.spots[rows]
+        by = Groups.of(distinct_rows([*spots[:, : Spot.LABEL + 1].T])[1])
         most = np.repeat(by.ends(counts)[1], by.sizes)
         beside = np.add.reduceat((2 * counts[by.order] >= most).astype(np.int64), by.begins)
-        numbers = np.minimum(beside, by.ends(together)[1])
+        numbers = np.minimum(beside, by.ends(spots[:, Spot.TOGETHER])[1])
         # The median, so that no single slice with a false detection counts.
         newest = np.sort(numbers[-_NEWEST_BESIDE:])[::-1]
         return max(1, int(newest[len(newest) // 2]))

@@ -145,9 +145,10 @@ def placed_stays(
 def _side_by_side(spots: Ints, stay_of: Ints) -> Ints:
     """Returns how many things stand side by side in the middle one of each stay's slices.
 
-    Spots are in the order of their stays and slices. Two of one message are never one thing.
+    Spots are in the order of their stays and slices. Two of one message are never one thing, and
+    those of two detectors may be.
     """
-    begins = run_starts(stay_of, spots[:, Spot.SLICE])
+    begins = run_starts(stay_of, *spots[:, : Spot.LABEL + 1].T)
     together = np.maximum.reduceat(spots[:, Spot.TOGETHER], begins)
     numbers = np.minimum(np.diff(begins, append=len(spots)), together)
     stays = stay_of[begins]

@@ -72,6 +72,20 @@ def test_things_that_stand_together_are_compared_by_their_number(tmp_path: Path)
     assert (same["things"], same["things_unchanged"]) == ({}, 1)
 
 
+def test_alike_things_that_two_detectors_see_do_not_stand_together(tmp_path: Path) -> None:
+    """Each message of both has all of them."""
+    things = [("pallet", 0.9, (2.0, y, 0.5)) for y in (-2.0, 0.0, 2.0)]
+    messages: list[Msg] = []
+    for at_s in range(30):
+        *posed, _ = scene(at_s, HERE, ())
+        at = BEGIN * S + at_s * S
+        messages += [*posed, *(detected(at, things, topic=topic) for topic in ("/left", "/right"))]
+    write_splits(tmp_path, messages)
+    found = ask(tmp_path, "find_things")
+    assert found["total"] == 3
+    assert not [thing for thing in found["things"] if "at_once" in thing]
+
+
 def test_of_two_that_stood_together_one_is_missing_where_the_other_is_now(tmp_path: Path) -> None:
     two, one = [("cup", 3.0, 0.0), ("cup", 3.0, 0.25)], ("cup", 3.0, -1.5)
     reply = compared(tmp_path, [*looked(0, 30, HERE, *two), *looked(60, 90, HERE, one)])
