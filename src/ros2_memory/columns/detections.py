@@ -43,6 +43,7 @@ from ros2_memory.core.text import looks_like_json
 from ros2_memory.messages.detections import (
     MAX_DEPTH,
     POSITIONS,
+    SAYS_ABSENT,
     SCORES,
     Detection,
     detections_of,
@@ -128,6 +129,7 @@ class Labels(NamedTuple):
         frames: texts that may name the frame, the outermost first.
         points: where their place may be, the first choice first; None if it depends on the message.
         is_best: whether the best of several hypotheses names an object.
+        flags: booleans, each with the value that says that there is no such object.
     """
 
     level: Level
@@ -137,6 +139,7 @@ class Labels(NamedTuple):
     frames: tuple[Leaf, ...]
     points: tuple[Point, ...] | None
     is_best: bool
+    flags: tuple[tuple[Leaf, bool], ...]
 
     @property
     def leaf(self) -> Leaf:
@@ -157,6 +160,10 @@ class Labels(NamedTuple):
         name = _names(values, self.names[0])
         for leaf in self.names[1:]:
             name = _texts_or(name, _names(values, leaf), replace_blank=True)
+        for leaf, absent in self.flags:
+            is_absent = values.numbers(leaf).values == absent
+            codes = np.where(is_absent, len(name.words), name.codes).astype(np.uint32)
+            name = Texts(codes, (*name.words, ""))
         score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
             column, leaf_error = values.floats(leaf)
@@ -331,7 +338,12 @@ def _labels(
     names, scores = _naming_leaves(named), _leaves(named, SCORES, Kind.INTEGER, Kind.REAL)
     if not names:
         return None
-    return Labels(names[0].level, names, scores, inner, frames, points, is_best)
+    flags = tuple(
+        (leaf, absent)
+        for flag, absent in SAYS_ABSENT.items()
+        for leaf in _leaves(named, (flag,), Kind.BOOLEAN)
+    )
+    return Labels(names[0].level, names, scores, inner, frames, points, is_best, flags)
 
 
 def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> Node:

@@ -57,7 +57,7 @@ _PLAIN: Final = 1
 _PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 44
+ROWS_VERSION: Final = 45
 """The version of the rules that make rows of a bag. A change ships all bags again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")

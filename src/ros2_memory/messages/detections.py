@@ -64,6 +64,11 @@ _NAMES_OF_SEEN: Final = ("name", "category", "id")
 """Fields that name an object which has a score and a place; of any other they say little."""
 _NOTHING: Final = "none"
 """The name by which JSON says that nothing was seen, without a score."""
+SAYS_ABSENT: Final = {
+    **dict.fromkeys(("out_of_stock", "missing", "absent"), True),
+    **dict.fromkeys(("in_stock", "present", "visible", "detected"), False),
+}
+"""Flags of an object, each with the value that says that it was looked for and is not there."""
 _NAMED_BY: Final = frozenset(LABELS).union(_NAMES_OF_SEEN, *NAMED_IN_TYPES)
 """An object without any of these fields has no name."""
 _NO_CONTENT: Final = frozenset({"header", "stamp", "timestamp", "frame_id"})
@@ -266,7 +271,9 @@ def _has_name_alone(value: JsonObject) -> bool:
 
 
 def _label(value: JsonObject) -> str | None:
-    """Returns the name of an object: a text before a whole number; None if it has none."""
+    """Returns the name of an object that is there: a text before a whole number; else None."""
+    if any(value.get(flag) is absent for flag, absent in SAYS_ABSENT.items()):
+        return None
     first_number = None
     for name in naming_fields(value):
         label = value.get(name)

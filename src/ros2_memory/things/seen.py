@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
-VERSION: Final = 16
+VERSION: Final = 17
 """The version of stored sights. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS

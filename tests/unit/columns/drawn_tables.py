@@ -71,7 +71,7 @@ UNMAPPED = {
     ),
     "own_msgs/msg/Label": "string label\nfloat32 score\nfloat64 x\nfloat64 y\nfloat64 z\n",
     "own_msgs/msg/Posed": (
-        "int32 class_id\nstring id\nfloat32 score\ngeometry_msgs/PoseStamped pose\n"
+        "int32 class_id\nstring id\nfloat32 score\ngeometry_msgs/PoseStamped pose\nbool missing\n"
     ),
     "own_msgs/msg/PosedArray": "std_msgs/Header header\nPosed[] objects\n",
     # As in autoware_perception_msgs.

@@ -89,6 +89,17 @@ def test_detections_are_named_and_placed_as_common_packages_do(
 
 
 @pytest.mark.parametrize(
+    ("flag", "present"),
+    [("out_of_stock", False), ("missing", False), ("in_stock", True), ("visible", True)],
+)
+def test_what_a_flag_says_is_not_there_is_not_seen(flag: str, present: bool) -> None:
+    item: JsonObject = {"label": "oat milk", "position": [1, 2, 3]}
+    shelf: JsonValue = [{**item, flag: present}, {**item, flag: not present}]
+    for said in (shelf, json.dumps(shelf)):
+        assert detections_of({"items": said}) == (Detection("oat milk", (1, 2, 3)),)
+
+
+@pytest.mark.parametrize(
     "said",
     [
         pytest.param('\n  {"label": "cup"}', id="behind white space"),
