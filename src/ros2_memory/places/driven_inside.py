@@ -16,13 +16,14 @@ import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import RobotTrack, cut_track, jumps
 from ros2_memory.analysis.motion.trajectory import (
+    LEAST_OF_SPEED_S,
     MAX_WAYPOINTS,
     Line,
     Waypoint,
     draw_waypoints,
     mean_speed,
 )
-from ros2_memory.core.arrays import Ints, rows_of, stable_order, stacked
+from ros2_memory.core.arrays import Ints, bounds_of, rows_of, stable_order, stacked
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -154,37 +155,34 @@ def totals_inside(line: Line, spans: Sequence[Span]) -> InsideTotals:
     """Returns what was driven along a line in spans; time in which they overlap counts once."""
     if not spans:
         return InsideTotals(0.0, 0.0)
-    distance_m, speeds = 0.0, []
-    for start, stop in united(spans):
-        first_m, last_m = line.metres_at(np.array([start, stop])).tolist()
-        distance_m += last_m - first_m
-        max_speed = _max_speed(line, start, stop, last_m - first_m)
-        if max_speed is not None:
-            speeds.append(max_speed)
-    return InsideTotals(distance_m, max(speeds, default=None))
+    starts, stops = bounds_of(united(spans))
+    driven_m = np.diff(line.metres_at(np.stack((starts, stops))), axis=0)[0]
+    lasted = stops - starts
+    is_short = (lasted >= LEAST_OF_SPEED_S * NS_PER_S) & (lasted <= _SPEED_NS)
+    speeds = driven_m[is_short] / lasted[is_short] * NS_PER_S
+    speeds = np.append(speeds, _speeds_over_second(line, starts, stops - _SPEED_NS))
+    return InsideTotals(float(driven_m.sum()), float(speeds.max()) if speeds.size else None)
 
 
-def _max_speed(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
-    """Returns the highest speed (m/s) over `_SPEED_NS`, or the mean of a shorter time.
+def _speeds_over_second(line: Line, starts: Ints, stops: Ints) -> Floats:
+    """Returns speeds (m/s) over `_SPEED_NS` from times in spans on, the highest among them.
 
     As the window of a second moves along the line, its speed is highest where one of its ends is at
-    a vertex, or at the start or the stop.
+    a vertex, or it begins at a start or a stop. None is returned of spans that stop before their
+    start.
     """
-    if stop - start <= _SPEED_NS:
-        return mean_speed(driven_m, unix_from_ns(stop - start))
-    end = stop - _SPEED_NS
-    begins_at_vertex = _between(line.times, start, end)
-    ends_at_vertex = _between(line.times, start + _SPEED_NS, stop) - _SPEED_NS
-    begin = np.concatenate(([start, end], begins_at_vertex, ends_at_vertex))
-    here, there = line.at(begin), line.at(begin + _SPEED_NS)
+    begins = np.concatenate((starts, stops, line.times, line.times - _SPEED_NS))
+    begins = begins[_span_numbers(begins, starts, stops) >= 0]
+    here, there = line.at(begins), line.at(begins + _SPEED_NS)
     # Metres are without jumps, but noise may shift some of them along the way.
-    moved = np.linalg.norm(there.places - here.places, axis=1)
-    return float(np.minimum(there.metres - here.metres, moved).max())
+    moved: Floats = np.linalg.norm(there.places - here.places, axis=1)
+    return np.minimum(moved, there.metres - here.metres)
 
 
-def _between(times: Ints, start: Ns, stop: Ns) -> Ints:
-    """Returns those of ascending times that lie in `[start, stop)`."""
-    return times[slice(*np.searchsorted(times, (start, stop)))]
+def _span_numbers(times: Ints, starts: Ints, stops: Ints) -> Ints:
+    """Returns the number of the span in which each time lies, ends included; -1 for none."""
+    numbers = np.searchsorted(starts, times, side="right") - 1
+    return np.where(times <= stops[numbers], numbers, -1)
 
 
 def _way_inside(line: Line, spans: Sequence[Span], at_most: int) -> tuple[Waypoint, ...]:
@@ -194,8 +192,14 @@ def _way_inside(line: Line, spans: Sequence[Span], at_most: int) -> tuple[Waypoi
     """
     if not spans:
         return ()
-    inside = stacked([_line_during(line, *span) for span in spans])
-    waypoints, _ = draw_waypoints(inside, max(at_most, _FEWEST_WAYPOINTS))
+    starts, stops = bounds_of(spans)
+    of_vertex = _span_numbers(line.times, starts + 1, stops - 1)
+    is_inner, is_long = of_vertex >= 0, stops > starts
+    first = dataclasses.replace(line.at(starts), jumps=np.ones(len(spans), np.bool_))
+    parts = stacked([first, rows_of(line, is_inner), line.at(stops[is_long])])
+    numbers = np.arange(len(spans))
+    order = np.lexsort((parts.times, np.append(numbers, (*of_vertex[is_inner], *numbers[is_long]))))
+    waypoints, _ = draw_waypoints(rows_of(parts, order), max(at_most, _FEWEST_WAYPOINTS))
     return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 
@@ -216,15 +220,6 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     if abs(math.remainder(measured_rad - waypoint.yaw_rad, math.tau)) > _TURNED_RAD:
         return dataclasses.replace(waypoint, yaw_rad=measured_rad)
     return waypoint
-
-
-def _line_during(line: Line, start: Ns, stop: Ns) -> Line:
-    """Returns the part of a line between two times. Its first vertex is marked as a jump."""
-    first = dataclasses.replace(line.at(np.array([start])), jumps=np.array([True]))
-    if stop == start:
-        return first
-    inner = np.flatnonzero((line.times > start) & (line.times < stop))
-    return stacked([first, rows_of(line, inner), line.at(np.array([stop]))])
 
 
 def farthest_from(

@@ -17,6 +17,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.motion.trajectory import Line
+from ros2_memory.core.arrays import Ints
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory
@@ -161,6 +163,33 @@ def test_what_was_driven_while_a_topic_said_so_takes_a_few_searches_of_many_bags
     reader.asked.clear()
     assert asked(memory, "trajectory_summary", **span)["duration_s"] == pytest.approx(600, abs=2)
     assert sum("/bumper" in topics for _, topics in reader.asked) < 20
+
+
+def test_metres_of_many_short_times_are_measured_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A topic says so every other second: one by one, the times of a day took 20 s."""
+    interpolated: list[int] = []
+    at = Line.at
+
+    def counting(line: Line, times: Ints) -> Line:
+        interpolated.append(len(times))
+        return at(line, times)
+
+    monkeypatch.setattr(Line, "at", counting)
+    looks = set()
+    for seconds in (40, 400):
+        bag = tmp_path / f"{seconds}" / "rec" / "rec_0.mcap"
+        poses = [odom(T0 + nth * S, nth / 10, nth % 2) for nth in range(seconds + 1)]
+        flags = [boolean(T0 + nth * S, nth % 4 < 2) for nth in range(seconds)]
+        write_mcap(bag, sorted([*poses, *flags], key=attrgetter("log_time")))
+        span = {"start": T0 // S, "end": T0 // S + seconds}
+        memory, during = memory_of(tmp_path / f"{seconds}"), {"while": CARRYING}
+        interpolated.clear()
+        driven = asked(memory, "trajectory_summary", **span, **during, max_waypoints=0)
+        assert driven["duration_s"] == pytest.approx(seconds / 2)
+        looks.add(len(interpolated))
+    assert len(looks) == 1
 
 
 def test_a_condition_that_always_held_leaves_out_no_metre_of_sparse_poses(tmp_path: Path) -> None:
