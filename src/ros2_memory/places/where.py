@@ -411,22 +411,22 @@ class Scope:
 def counted_stays(view: View, where: Where | None, scope: Scope, path: Span) -> list[Spans]:
     """Returns the parts of each of the robot's stays in a place that lie in a scope, in order.
 
-    Without a place all of its path, from the first to the last log time, is one stay, but for gaps
-    of the recording that end a stay in a place, too. Stays without such a part are left out; all
-    ends are inclusive.
+    They lie on its path, from the first to the last log time. Without a place all of it is one
+    stay, but for gaps of the recording that end a stay in a place, too. Stays without such a part
+    are left out; all ends are inclusive.
 
     Raises:
         InvalidArgumentsError, NoDataError, QueryTimeoutError: as `known_track_for` does.
     """
-    window = scope.window
+    first, last = path
+    window, driven = scope.window, TimeWindow(first, last + 1)
     if where is None:
-        first, last = path
         gaps = [gap for gap in recording_gaps(view, window) if gap[1] - gap[0] > SILENCE_NS]
-        recorded = without([(first, last + 1)], united(gaps))
+        recorded = without([(driven.start, driven.stop)], united(gaps))
         spans = [(start, stop - 1) for start, stop in recorded]
     else:
         track = known_track_for(view, where, window).track
-        spans = [stay.span for stay in stays_within(track, where.region, window)]
+        spans = [stay.span for stay in stays_within(track, where.region, driven)]
     parts_of_stays = (scope.parts_of(*span) for span in spans)
     return [parts for parts in parts_of_stays if parts]
 

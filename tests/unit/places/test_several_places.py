@@ -165,6 +165,18 @@ def test_what_was_driven_while_a_topic_said_so_takes_a_few_searches_of_many_bags
     assert sum("/bumper" in topics for _, topics in reader.asked) < 20
 
 
+def test_a_way_that_began_inside_before_the_window_begins_with_the_first_pose_of_it(
+    tmp_path: Path,
+) -> None:
+    poses = [odom(T0 + (4 * nth + 1) * S // 4, nth / 10) for nth in range(40)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    span = {"start": T0 // S + 5, "end": T0 // S + 15}
+    inside = {"where": {"x": 0, "y": 0, "radius_m": 9}}
+    driven = asked(memory_of(tmp_path), "trajectory_summary", **span, **inside)
+    assert driven["start"] == driven["waypoints"][0]["timestamp"] == T0 // S + 5.25
+    assert (driven["end"], driven["duration_s"], driven["avg_speed"]) == (T0 // S + 14.25, 9, 0.1)
+
+
 def test_metres_of_many_short_times_are_measured_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
