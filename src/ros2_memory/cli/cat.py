@@ -110,7 +110,7 @@ def extract_values(
     Raises:
         InvalidArgumentsError: no message has such fields.
     """
-    count, undecodable, lacking, refusals = 0, 0, set[str](), Counter[str]()
+    count, undecodable, refusals = 0, 0, Counter[str]()
     for stored in messages:
         message = view.bags.decode(stored)
         if message is None:
@@ -120,9 +120,8 @@ def extract_values(
             value = _value_of(view.extractor, message, stored.type, fields, exact=exact)
         except InvalidArgumentsError as refusal:
             refusals[str(refusal)] += 1
-            lacking.add(stored.type)
-            if not count and lacking.issuperset(view.timeline.types_of(stored.topic)):
-                break  # no other type may have them
+            if not count and len(view.timeline.types_of(stored.topic)) == 1:
+                break  # the others have no other type
             continue
         yield stored.time, value
         count += 1
@@ -151,13 +150,14 @@ def _value_of(
     Raises:
         InvalidArgumentsError: the message lacks a field.
     """
-    if exact and not fields:
+    if not exact:
+        return extractor.shown(message, type_name, fields).value
+    if not fields:
         return extractor.exact(message, type_name)
-    exact_values = {path: extractor.exact_at(message, type_name, path) for path in fields}
-    if exact and None not in exact_values.values():
-        return exact_values
-    shown = extractor.shown(message, type_name, fields)  # which refuses what is absent
-    return exact_values if exact else shown.value
+    values = {path: extractor.exact_at(message, type_name, path) for path in fields}
+    if None in values.values():
+        extractor.shown(message, type_name, fields)  # refuses a field that is absent
+    return values
 
 
 def _csv_lines(rows: Iterable[Row]) -> Iterator[str]:

@@ -3,7 +3,9 @@
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
+from typing import cast
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -18,7 +20,7 @@ from ros2_memory.cli.output import (
     print_reply,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.model import BagFile
+from ros2_memory.core.model import BagFile, JsonValue
 from ros2_memory.core.reply import JsonObject, shown
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import unix_from_ns
@@ -85,9 +87,9 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
         own, memory = open_robot(settings, name, verbose=bags.verbose)
         reports[name] = report = _report(own, memory)
         has_bags = has_bags or bool(memory.snapshot().bags)
-        if robots and not as_json:
-            print_line(f"\n{name}")
         if not as_json:
+            if robots:
+                print_line(f"\n{name}")
             _print_report(memory, report)
     if as_json:
         print_json(reports if robots else reports[""])
@@ -111,11 +113,10 @@ def _print_report(memory: Memory, report: Mapping[str, JsonObject]) -> None:
         return
     values = {key: value for part in report.values() for key, value in filled_leaves(part).items()}
     for key, value in [*values.items()]:
-        if value in (None, []) or key.endswith("_local") or key == "notes":
+        if value in (None, []) or key.endswith("_local"):
             del values[key]
-    print_reply(values)
-    lists = [part.get("notes") for part in report.values()]
-    print_notes({str(note): None for some in lists if isinstance(some, list) for note in some})
+    lists = (cast("list[JsonValue]", part.get("notes", [])) for part in report.values())
+    print_reply(values | {"notes": [*chain.from_iterable(lists)]})
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
@@ -170,7 +171,7 @@ def _recording_rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
     bags_by_folder = recordings_of(snapshot)
     for path in sorted(bags_by_folder, key=lambda path: bags_by_folder[path][0].start):
         bags = bags_by_folder[path]
-        start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+        start, end = bags[0].start, max(bag.end for bag in bags)
         whose = None
         if Path(path).is_relative_to(root / MOMENTS_FOLDER):
             whose = "saved moment"

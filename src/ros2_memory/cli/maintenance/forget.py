@@ -467,7 +467,7 @@ class _Forget:
         try:
             append_deleted(self._bag_dir, deleted)
         except OSError as error:
-            self.stays.append(f"the list of deleted bags: {error.strerror or error}")
+            self.stays.append(f"the list of deleted bags: {reason_of(error)}")
 
     def _delete_files(self, bags: Sequence[BagFile]) -> tuple[list[BagFile], int]:
         """Deletes bags, plain and compressed; returns those that are gone, and the bytes freed."""
@@ -480,7 +480,7 @@ class _Forget:
                 except FileNotFoundError:
                     continue
                 except OSError as error:
-                    self.stays.append(f"{self._name(path)}: {error.strerror or error}")
+                    self.stays.append(f"{self._name(path)}: {reason_of(error)}")
                     staying.add(path)
         return [bag for bag in bags if bag.path not in staying], freed
 
@@ -491,7 +491,7 @@ class _Forget:
             try:
                 remove_emptied(self._bag_dir, recording)
             except OSError as error:
-                self.stays.append(f"{self._name(recording)}: {error.strerror or error}")
+                self.stays.append(f"{self._name(recording)}: {reason_of(error)}")
 
     def _forget_days(self, deleted: Iterable[BagFile]) -> None:
         """Deletes what `memory/` has of its deleted days besides their messages."""
@@ -513,7 +513,7 @@ class _Forget:
             last_s = -(-max(forgetting.stop for forgetting in forgettings) // NS_PER_S)
             self.stays.append(
                 f"what a lake has of it: {self._bag_dir / FORGOTTEN_FILE} cannot be written "
-                f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
+                f"({reason_of(error)}); if these bags are shipped, run `ros2-memory ship "
                 f"--forget ROBOT --start {first_s} --end {last_s}` where that is done"
             )
             return
