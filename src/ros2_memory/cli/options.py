@@ -111,21 +111,6 @@ def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
     return replace(settings, fleet=replace(settings.fleet, robots={}, tokens={}))
 
 
-def load_to_delete(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
-    """Loads the configuration for a command that deletes bags, which takes no PATH.
-
-    Raises:
-        ConfigError: the configuration is refused.
-        InvalidArgumentsError: a word is a path.
-    """
-    path = next(filter(is_folder, words or ()), None)
-    if path is not None:
-        raise InvalidArgumentsError(
-            f"{path} is no setting: name the bag directory as --bag-dir {path}"
-        )
-    return load_for(bag_dir, words)
-
-
 def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
     """Loads the configuration by `load_to_look` if a word is a path, else by `load_for`."""
     if any(map(_is_path, words or ())):

@@ -120,7 +120,8 @@ def test_a_folder_that_is_no_option_bags_that_others_record_and_no_window_are_re
     bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
     refused = forget(2, 0, 100, f"{bag_dir} --yes").err
-    assert f"{bag_dir} is no setting: name the bag directory as --bag-dir {bag_dir}" in refused
+    assert f"'{bag_dir}' is not a setting" in refused
+    assert f"a folder of bags is given as recording.bag_dir={bag_dir}" in refused
     for deployment in ("query_only", "replay"):
         assert "recorder=none" in forget(2, 0, 100, f"--yes deployment={deployment}").err
     exits(2, "forget --yes")

@@ -50,7 +50,7 @@ from ros2_memory.cli.options import (
     Times,
     Verbose,
     lines_as_json,
-    load_to_delete,
+    load_for,
     open_memory,
     require_recorder,
 )
@@ -105,7 +105,7 @@ def forget(
     records.
     """
     with lines_as_json(as_json, is_answered=yes or dry_run):
-        settings = load_to_delete(bag_dir, overrides)
+        settings = load_for(bag_dir, overrides)
         require_recorder(settings)
         if not times.are_bounded:
             raise InvalidArgumentsError(f"give a time window: {BOUNDED}")
