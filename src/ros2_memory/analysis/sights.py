@@ -78,13 +78,16 @@ _MAX_AWAY_M: Final = 1e8
 """The farthest place: UTM reaches 1e7 m, and squares (mm2) of more would be beyond 63 bits."""
 _MAX_SCORE: Final = 1e6
 _TOGETHER_MESSAGES: Final = 3
+_NO_IDS: Final = frozenset({"", "-1"})
+"""What trackers write for an object that they do not follow."""
 
 
-Spot = IntEnum("Spot", "SLICE TOPIC LABEL N X Y Z DEV FIRST LAST BEST TOGETHER", start=0)
+Spot = IntEnum("Spot", "SLICE TOPIC LABEL N X Y Z DEV FIRST LAST BEST TOGETHER ID", start=0)
 """Columns of `Sights.spots`.
 
 `DEV` is the root mean square distance of the detections in the plane; `BEST` is -1 without scores;
-`TOGETHER` is how many of the label at least three messages had at once, or all had.
+`TOGETHER` is how many of the label at least three messages had at once, or all had; `ID` the id of
+most of the detections that have one.
 """
 
 Look = IntEnum("Look", "SLICE TOPIC X Y YAW PAN N FIRST LAST Z LEAN", start=0)
@@ -135,6 +138,7 @@ class DetectorMessages(NamedTuple):
         names: the labels; some may have no detection.
         places: for each detection, x, y, z (m); NaN if not known.
         scores: for each detection, its score; not finite if it has none.
+        ids: for each detection, the index of its id in `id_names`; "" there is none.
     """
 
     times: Ints
@@ -144,6 +148,8 @@ class DetectorMessages(NamedTuple):
     names: tuple[str, ...]
     places: Floats
     scores: Floats
+    ids: Ints
+    id_names: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,6 +159,7 @@ class Sights:
     Attributes:
         topics: the topics of the detectors.
         labels: the labels that they saw.
+        ids: the ids of spots; "" stands for none.
         spots: where labels were seen (`Spot`).
         looks: from where detectors published (`Look`).
         hits: how often a spot was seen in a look (`Hit`).
@@ -164,6 +171,7 @@ class Sights:
 
     topics: tuple[str, ...]
     labels: tuple[str, ...]
+    ids: tuple[str, ...]
     spots: Ints
     looks: Ints
     hits: Ints
@@ -198,6 +206,7 @@ class _Detections:
     z: Ints
     score: Floats
     is_placed: Flags
+    id: Ints
 
 
 def sights_of(topic: str, seen: DetectorMessages) -> Sights:
@@ -218,8 +227,10 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     placed = rows_of(detections, in_spot)
     is_scored = ~np.isnan(placed.score)
     row, other_label = _labels_beside(placed)
+    own_id, ids = _ids_of_spots(spot, placed.id, seen.id_names)
+    spots = _spots(placed, spot, seen.times, together[group[in_spot]])
     tables = (
-        _spots(placed, spot, seen.times, together[group[in_spot]]),
+        np.column_stack((spots, own_id)),
         looks,
         pair_counts(spot, look[placed.message]),
         pair_counts(spot[is_scored], bin_of(_thousandths(placed.score[is_scored]))),
@@ -227,7 +238,7 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
         _unplaced(rows_of(detections, ~in_spot), seen.times),
         np.zeros((0, len(Fix)), np.int64),
     )
-    return Sights((topic,), labels, *tables)
+    return Sights((topic,), labels, ids, *tables)
 
 
 def fixes_of(times: Ints, jumps_m: Floats, sigma_m: Floats) -> Sights:
@@ -243,7 +254,7 @@ def fixes_of(times: Ints, jumps_m: Floats, sigma_m: Floats) -> Sights:
     jumps = _mm(np.minimum(jumps_m, _MAX_AWAY_M))
     columns = (times // SLICE_NS, _rounded(times), jumps, sigmas)
     empty = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
-    return Sights((), (), *(*empty, np.stack(columns, axis=1)))
+    return Sights((), (), (), *(*empty, np.stack(columns, axis=1)))
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
@@ -296,7 +307,9 @@ def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tupl
         is_placed: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(is_placed[:, None], seen.places, 0.0)).T
     scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
-    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, is_placed)
+    detections = _Detections(
+        seen.rows, slices[seen.rows], label, x, y, z, scores, is_placed, seen.ids
+    )
     if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = run_starts(rows[:, 0])
@@ -449,6 +462,21 @@ def _spots(detections: _Detections, spot: Ints, times: Ints, together: Ints) -> 
     topic = np.zeros(len(n), np.int64)
     columns = (n, x, y, z, dev, first, last, best, together[firsts])
     return np.stack((detections.slice[firsts], topic, detections.label[firsts], *columns), axis=1)
+
+
+def _ids_of_spots(spot: Ints, ids: Ints, names: Sequence[str]) -> tuple[Ints, tuple[str, ...]]:
+    """Returns the id of each spot, and their names in order.
+
+    `spot` and `ids` are for each detection. The id is that of most detections with one; of no
+    object has a detector -1.
+    """
+    words = [shortened(name, MAX_LABEL_CHARS) for name in names]
+    has_id = np.array([word not in _NO_IDS for word in words], np.bool_)[ids]
+    chosen = np.full(int(spot.max(initial=-1)) + 1, len(words))
+    with_id, own_id, n = pair_counts(spot[has_id], ids[has_id]).T
+    is_most = 2 * n > np.bincount(with_id, n)[with_id]
+    chosen[with_id[is_most]] = own_id[is_most]
+    return sorted_codes(chosen, [*words, ""])
 
 
 def _unplaced(detections: _Detections, times: Ints) -> Ints:

@@ -41,6 +41,7 @@ from ros2_memory.core.arrays import (
 )
 from ros2_memory.core.text import looks_like_json
 from ros2_memory.messages.detections import (
+    IDS,
     MAX_DEPTH,
     POSITIONS,
     SAYS_ABSENT,
@@ -128,6 +129,7 @@ class Labels(NamedTuple):
         inner: where detections may be inside an object that has no name.
         frames: texts that may name the frame, the outermost first.
         points: where their place may be, the first choice first; None if it depends on the message.
+        ids: what may tell the objects from others of their name, the last choice first.
         is_best: whether the best of several hypotheses names an object.
         flags: booleans, each with the value that says that there is no such object.
     """
@@ -138,6 +140,7 @@ class Labels(NamedTuple):
     inner: tuple[Source, ...]
     frames: tuple[Leaf, ...]
     points: tuple[Point, ...] | None
+    ids: tuple[Leaf, ...]
     is_best: bool
     flags: tuple[tuple[Leaf, bool], ...]
 
@@ -338,12 +341,13 @@ def _labels(
     names, scores = _naming_leaves(named), _leaves(named, SCORES, Kind.INTEGER, Kind.REAL)
     if not names:
         return None
+    ids = _leaves(fields, IDS, Kind.TEXT, Kind.INTEGER)
     flags = tuple(
         (leaf, absent)
         for flag, absent in SAYS_ABSENT.items()
         for leaf in _leaves(named, (flag,), Kind.BOOLEAN)
     )
-    return Labels(names[0].level, names, scores, inner, frames, points, is_best, flags)
+    return Labels(names[0].level, names, scores, inner, frames, points, ids, is_best, flags)
 
 
 def _without_low_object(node: dict[str, Node], labels: Labels, least: float) -> Node:
@@ -448,6 +452,7 @@ class Detections(NamedTuple):
         scores: in the detector's own unit; NaN without one.
         places: N x 3 (m), in `frames`; NaN without one.
         frames: the frame of each place; empty if the message names none.
+        ids: what tells objects of one label apart; empty if nothing does.
     """
 
     rows: IntArray
@@ -455,6 +460,7 @@ class Detections(NamedTuple):
     scores: Floats
     places: Points
     frames: Texts
+    ids: Texts
 
     def at(self, rows: IntArray) -> Detections:
         """Returns the detections of some messages, which become the messages 0, 1, 2, ...
@@ -467,13 +473,14 @@ class Detections(NamedTuple):
 
     def select(self, which: IntArray | Mask) -> Detections:
         """Returns the detections at some positions, or those that a mask picks."""
-        rows, labels, scores, places, frames = self
+        rows, labels, scores, places, frames, ids = self
         return Detections(
             rows[which],
             labels.at(which),
             scores[which],
             places[which],
             frames.at(which),
+            ids.at(which),
         )
 
 
@@ -576,7 +583,7 @@ def _read_stamped(table: Table, plan: _Plan) -> StampedDetections:
     detections = joined_detections(
         [part for source in plan.sources for part in detections_in(values, source, places=True)]
     )
-    frames = _frames_at(values, ROWS, np.arange(values.rows), plan.frames)
+    frames = _texts_at(values, ROWS, np.arange(values.rows), plan.frames)
     header_frames = frames.at(detections.rows)
     return StampedDetections(
         detections._replace(frames=_texts_or(detections.frames, header_frames)),
@@ -599,6 +606,7 @@ def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
         np.array([detection.score for detection in detections], np.float64),  # of None: NaN
         np.array([detection.place or nowhere for detection in detections]).reshape(-1, 3),
         Texts.of([detection.frame_id for detection in detections]),
+        Texts.of([detection.id for detection in detections]),
     )
 
 
@@ -616,6 +624,7 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
         np.concatenate([part.scores for part in parts])[order],
         np.concatenate([part.places for part in parts])[order],
         joined_texts([part.frames for part in parts])[order],
+        joined_texts([part.ids for part in parts])[order],
     )
 
 
@@ -668,11 +677,12 @@ def _detections_at(
         named.name,
         named.score,
         np.full((positions.size, 3), math.nan),
-        _no_frames(positions.size),
+        _no_texts(positions.size),
+        _no_texts(positions.size),
     )
 
 
-def _no_frames(count: int) -> Texts:
+def _no_texts(count: int) -> Texts:
     return Texts(np.zeros(count, np.uint32), ("",))
 
 
@@ -694,18 +704,18 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     positions = range_numbers(counts)
     rows = _owners_at(values, source.leaf.level, positions, ROWS)
     detections = parsed.select(nth)
-    frames = _frames_at(values, source.leaf.level, positions, source.frames)
+    frames = _texts_at(values, source.leaf.level, positions, source.frames)
     yield detections._replace(rows=rows, frames=_texts_or(detections.frames, frames))
 
 
 def _with_places(
     values: Values, source: Labels, positions: IntArray, detections: Detections
 ) -> Detections:
-    """Returns detections with their place: the first point of each that is valid."""
+    """Returns detections with their id and place: the first point of each that is valid."""
     if source.points is None:
         raise UnknownShapeError("points are of another shape in each message")
     level, places = source.level, detections.places
-    frames = _frames_at(values, level, positions, source.frames)
+    frames = _texts_at(values, level, positions, source.frames)
     for point in source.points:
         at = _owners_at(values, level, positions, point.axes[0].level)
         axes = [values.numbers(leaf).values[at] for leaf in point.axes]
@@ -714,19 +724,20 @@ def _with_places(
         is_valid = np.isfinite(place).all(axis=1) & place.any(axis=1)
         is_new = is_valid & np.isnan(places[:, 0])
         places = np.where(is_new[:, None], place, places)
-        point_frames = _frames_at(values, level, positions, point.frames)
+        point_frames = _texts_at(values, level, positions, point.frames)
         codes = np.where(is_new, point_frames.codes + 1, 0).astype(np.uint32)
         frames = _texts_or(Texts(codes, ("", *point_frames.words)), frames)
-    return detections._replace(places=places, frames=frames)
+    ids = _texts_at(values, level, positions, source.ids)
+    return detections._replace(places=places, frames=frames, ids=ids)
 
 
-def _frames_at(values: Values, level: Level, positions: IntArray, leaves: Sequence[Leaf]) -> Texts:
-    """Returns the frame at some positions of a level: the one that the innermost object names."""
-    frames = _no_frames(positions.size)
+def _texts_at(values: Values, level: Level, positions: IntArray, leaves: Sequence[Leaf]) -> Texts:
+    """Returns the text at some positions of a level, as a frame: the last one that is not empty."""
+    texts = _no_texts(positions.size)
     for leaf in leaves:
-        texts = values.texts(leaf).at(_owners_at(values, level, positions, leaf.level))
-        frames = _texts_or(texts, frames)
-    return frames
+        words = _names(values, leaf).at(_owners_at(values, level, positions, leaf.level))
+        texts = _texts_or(words, texts)
+    return texts
 
 
 def _owners_at(values: Values, level: Level, positions: IntArray, outer: Level) -> IntArray:

@@ -1,17 +1,17 @@
 """Sights as few bytes, and the sights of many parts of a history joined.
 
 A packed part has sections, each of one stretch of the clock and one session. It is a zstd frame: a
-line of JSON with the names of topics and of labels, how many rows each section has in each table,
-and how many bytes a number takes in each table; then table after table the lowest bytes of all
-numbers, column by column, the next ones, and so on. A number is how much it is more than the one
-above it in its column, its sign in the lowest bit. Times are in us. A minute of a detector that
+line of JSON with the names of topics, of labels and of ids, how many rows each section has in each
+table, and how many bytes a number takes in each table; then table after table the lowest bytes of
+all numbers, column by column, the next ones, and so on. A number is how much it is more than the
+one above it in its column, its sign in the lowest bit. Times are in us. A minute of a detector that
 sees a room takes some 400 bytes.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -48,18 +48,12 @@ _Kind: TypeAlias = type[IntEnum]
 
 _AT_ONCE: Final = 16
 """So many parts are unpacked together."""
-_TOPICS: Final[dict[_Kind, int]] = {
-    Spot: Spot.TOPIC,
-    Look: Look.TOPIC,
-    Unplaced: Unplaced.TOPIC,
-}
-"""The column of each table that has numbers of topics."""
-_LABELS: Final[dict[_Kind, int]] = {
-    Spot: Spot.LABEL,
-    Unplaced: Unplaced.LABEL,
-    Beside: Beside.LABEL,
-}
-"""The column of each table that has numbers of labels."""
+_NAMED: Final[tuple[dict[_Kind, int], ...]] = (
+    {Spot: Spot.TOPIC, Look: Look.TOPIC, Unplaced: Unplaced.TOPIC},
+    {Spot: Spot.LABEL, Unplaced: Unplaced.LABEL, Beside: Beside.LABEL},
+    {Spot: Spot.ID},
+)
+"""The column of each table that has numbers of topics, of labels and of ids."""
 _TIMES: Final[dict[_Kind, list[int]]] = {
     Spot: [Spot.FIRST, Spot.LAST],
     Look: [Look.FIRST, Look.LAST],
@@ -83,7 +77,7 @@ def pack_sights(sights: Sights, rows: Ints | None = None) -> bytes:
         columns[_TIMES.get(kind, [])] //= NS_PER_US
         written.append(in_planes(unsigned(np.diff(columns, axis=1, prepend=0))))
     widths, planes = zip(*written, strict=True)
-    head = json.dumps((sights.topics, sights.labels, in_tables, widths))
+    head = json.dumps((sights.topics, sights.labels, sights.ids, in_tables, widths))
     return compress(b"".join((head.encode(), b"\n", *planes)))
 
 
@@ -96,11 +90,15 @@ class JoinedSights:
 
     Attributes:
         epochs: of each slice.
+        sessions: of each slice; one of them, if several saw something in one epoch then.
+        ids: "" is the first.
     """
 
     topics: tuple[str, ...]
     labels: tuple[str, ...]
+    ids: tuple[str, ...]
     epochs: Ints
+    sessions: Ints
     spots: Columns
     looks: Columns
     hits: Columns
@@ -110,12 +108,8 @@ class JoinedSights:
     fixes: Columns
 
 
-@dataclass(slots=True)
-class _Names:
-    """The numbers of topics and of labels, in the order in which they were first met."""
-
-    topics: dict[str, int] = field(default_factory=dict)
-    labels: dict[str, int] = field(default_factory=dict)
+_Names: TypeAlias = tuple[dict[str, int], ...]
+"""The numbers of topics, of labels and of ids, in the order in which they were first met."""
 
 
 @dataclass(slots=True)
@@ -147,24 +141,26 @@ def join_sights(
         epochs: the epoch of each of their sections.
         sessions: the session of each section.
     """
-    names = _Names()
+    names: _Names = ({}, {}, {"": 0})
     tables, sections = _read_tables(parts, names)
     _refer_across_sections(tables, sections)
-    topics = _rank_names(tables, _TOPICS, names.topics)
-    labels = _rank_names(tables, _LABELS, names.labels)
-    epoch_of_slice = _number_slices(tables, np.array(epochs, np.int64))
-    _sort_tables(tables, np.array(sessions, np.int64))
+    topics, labels, ids = (
+        _rank_names(tables, column_of, number_of)
+        for column_of, number_of in zip(_NAMED, names, strict=True)
+    )
+    session_of_section = np.array(sessions, np.int64)
+    of_slices = _number_slices(tables, np.array(epochs, np.int64), session_of_section)
+    _sort_tables(tables, session_of_section)
     columns = (Columns(tables[kind].columns) for kind in TABLES)
-    return JoinedSights(topics, labels, epoch_of_slice, *columns)
+    return JoinedSights(topics, labels, ids, *of_slices, *columns)
 
 
 def unite_sights(parts: Sequence[bytes]) -> bytes:
     """Returns packed parts as one, with the sections of all."""
-    names = _Names()
+    names: _Names = ({}, {}, {})
     tables, rows = _unpack(parts, names)
-    return pack_sights(
-        Sights((*names.topics,), (*names.labels,), *(table.T for table in tables)), rows
-    )
+    topics, labels, ids = map(tuple, names)
+    return pack_sights(Sights(topics, labels, ids, *(table.T for table in tables)), rows)
 
 
 def _read_tables(parts: Sequence[bytes], names: _Names) -> tuple[dict[_Kind, _Table], int]:
@@ -212,9 +208,8 @@ def _unpack(parts: Sequence[bytes], names: _Names) -> tuple[list[Ints], Ints]:
     rows = [np.empty((0, len(TABLES)), np.int64)]
     for part in parts:
         head, data = decompress(part).split(b"\n", 1)
-        topics, labels, in_tables, widths = json.loads(head)
-        topic_numbers = _numbers_of(topics, names.topics)
-        label_numbers = _numbers_of(labels, names.labels)
+        *names_of_part, in_tables, widths = json.loads(head)
+        numbers = [*map(_numbers_of, names_of_part, names)]
         rows.append(np.array(in_tables, np.int64).reshape(-1, len(TABLES)))
         counts = rows[-1].sum(axis=0).tolist()
         begin = 0
@@ -223,10 +218,9 @@ def _unpack(parts: Sequence[bytes], names: _Names) -> tuple[list[Ints], Ints]:
             begin += len(kind) * count * width
             table = np.cumsum(steps.reshape(len(kind), count), axis=1, dtype=np.int64)
             table[_TIMES.get(kind, [])] *= NS_PER_US
-            if kind in _TOPICS:
-                table[_TOPICS[kind]] = topic_numbers[table[_TOPICS[kind]]]
-            if kind in _LABELS:
-                table[_LABELS[kind]] = label_numbers[table[_LABELS[kind]]]
+            for column_of, number_of in zip(_NAMED, numbers, strict=True):
+                if kind in column_of:
+                    table[column_of[kind]] = number_of[table[column_of[kind]]]
             of_kind.append(table)
     return [np.concatenate(of_kind, axis=1) for of_kind in tables], np.concatenate(rows)
 
@@ -266,22 +260,27 @@ def _rank_names(
     return tuple(ordered)
 
 
-def _number_slices(tables: Mapping[_Kind, _Table], epoch_of_section: Ints) -> Ints:
-    """Numbers the slices in order of time; returns the epoch of each."""
+def _number_slices(
+    tables: Mapping[_Kind, _Table], epoch_of_section: Ints, session_of_section: Ints
+) -> tuple[Ints, Ints]:
+    """Numbers the slices in order of time; returns the epoch and a session of each."""
     timed = [tables[kind] for kind in _TIMES]
     # Many rows of one slice follow each other: one of each run is compared.
     runs = [run_starts(table.columns[0], table.section) for table in timed]
-    slices, epochs = [], []
+    slices, sections = [], []
     for table, begins in zip(timed, runs, strict=True):
         slices.append(table.columns[0][begins])
-        epochs.append(epoch_of_section[table.section[begins]])
-    distinct, numbers = distinct_rows([np.concatenate(slices), np.concatenate(epochs)])
+        sections.append(table.section[begins])
+    section = np.concatenate(sections)
+    distinct, numbers = distinct_rows([np.concatenate(slices), epoch_of_section[section]])
+    sessions = np.zeros(len(distinct), np.int64)
+    sessions[numbers] = session_of_section[section]
     numbers = narrowed(numbers)
     for table, begins in zip(timed, runs, strict=True):
         sizes = np.diff(begins, append=len(table.section))
         table.columns[0] = np.repeat(numbers[: len(begins)], sizes)
         numbers = numbers[len(begins) :]
-    return distinct[:, 1]
+    return distinct[:, 1], sessions
 
 
 def _sort_tables(tables: Mapping[_Kind, _Table], session_of_section: Ints) -> None:

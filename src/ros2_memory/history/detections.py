@@ -67,7 +67,7 @@ class Detected(NamedTuple):
         A detector that hangs publishes its last message again and again: with equal stamp, frame
         and detections.
         """
-        rows, labels, scores, places, frames = self.found
+        rows, labels, scores, places, frames, _ = self.found
         columns = np.column_stack((labels.codes, frames.codes, scores, places))
         begins = begins_of(rows, len(self.log_times)).tolist()
         last_content: dict[tuple[Ns, int], bytes] = {}

@@ -408,6 +408,7 @@ class _ThingsBetween:
             label=instance.label,
             before=None if before is None else before.part,
             after=None if after is None else after.part,
+            id=instance.id,
         )
         estimate = self.known.estimate
         if before is None and after is not None:

@@ -10,7 +10,7 @@
   state, or the object of a command.
 - The place is a point in metres at one of `POSITIONS`, in the frame that the innermost object
   around it names. Boxes in an image are in pixels, and give no place.
-- The score is a number under one of `SCORES`.
+- The score is a number under one of `SCORES`, the id a text or a whole number under one of `IDS`.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
 
 SCORES: Final = ("score", "confidence", "probability")
+IDS: Final = ("id", "tracking_id", "track_id", "object_id", "instance_id")
+"""Fields that may tell an object from others of its name, the last choice first."""
 HYPOTHESES: Final = ("results", "classification")
 """Fields with the possible classes of an object, in vision_msgs and autoware_perception_msgs."""
 NOT_LABELLED: Final = frozenset({"stride"})
@@ -86,12 +88,14 @@ class Detection(NamedTuple):
         place: in metres, in `frame_id`; None if the message has none.
         frame_id: empty if the message names no frame.
         score: in the detector's own unit; None if it gives none.
+        id: what the detector tells it from others by; empty if it does not.
     """
 
     label: str
     place: Vector3 | None = None
     frame_id: str = ""
     score: float | None = None
+    id: str = ""
 
 
 def detections_of(
@@ -279,10 +283,21 @@ def _label(value: JsonObject) -> str | None:
         label = value.get(name)
         if isinstance(label, str) and label.strip():
             return label
-        is_number = isinstance(label, int) and not isinstance(label, bool)
-        if is_number and first_number is None:
-            first_number = label.name if isinstance(label, NamedNumber) else str(label)
+        first_number = first_number or _number_as_text(label)
     return first_number
+
+
+def _number_as_text(value: JsonValue) -> str | None:
+    """Returns the name of a whole number, else its digits; None for another value."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        return None
+    return value.name if isinstance(value, NamedNumber) else str(value)
+
+
+def _id(value: JsonObject) -> str:
+    ids = (value.get(name) for name in reversed(IDS))
+    words = (word if isinstance(word, str) else _number_as_text(word) for word in ids)
+    return next(filter(None, words), "")
 
 
 def _best_result(results: JsonValue) -> JsonObject | None:
@@ -323,8 +338,9 @@ def _detection_at(
     """Returns a detection at the first valid point of some objects.
 
     A point of zeros counts as not filled in. `frame` is that of the objects; an object on the path
-    to the point may name another.
+    to the point may name another. The last object has the id.
     """
+    own_id = _id(objects[-1])
     for value, path in product(objects, POSITIONS):
         if path and path[0] not in value:
             continue
@@ -336,8 +352,8 @@ def _detection_at(
                 point_frame = _frame(node) or point_frame
         point = xyz(node) if isinstance(node, dict) else triple(node)
         if point is not None and any(point) and all(map(math.isfinite, point)):
-            return Detection(label, point, point_frame, score)
-    return Detection(label, None, frame, score)
+            return Detection(label, point, point_frame, score, own_id)
+    return Detection(label, None, frame, score, own_id)
 
 
 def parsed_json(text: str) -> JsonValue:

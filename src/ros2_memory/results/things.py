@@ -152,6 +152,7 @@ def thing(most_stays: int) -> Keys:
     """Returns the keys of a thing with the `most_stays` newest of its places."""
     return keys(
         NAME("label").in_short,
+        NAME("id").if_any.in_short,
         COUNTS_BY_NAME("labels").if_any,
         NAMES("misread_as").if_any,
         PLAIN("moves").if_any.in_short,
@@ -183,6 +184,7 @@ class Thing:
 
     Attributes:
         label: its name.
+        id: what detectors tell it by from others of its name; empty if nothing lasts.
         place: its last place (m), in `frame_id`.
         spread_m: root mean square distance of its detections from `place`.
         inside: the named places that it is in, the smallest first.
@@ -212,6 +214,7 @@ class Thing:
     median: float | None
     robot: tuple[float, float, float] | None
     still_there: StillThere | None
+    id: str = ""
     moved: tuple[ThingStay, ...] = ()
     misread_as: tuple[str, ...] = ()
     labels: tuple[tuple[str, int], ...] = ()
@@ -312,6 +315,7 @@ def _spot(name: str, time: str) -> Unit:
 
 @result(
     _LABEL("label"),
+    NAME("id").if_any,
     _spot("last_seen", "end")("was", "before").if_known,
     _spot("first_seen", "start")("is", "after").if_known,
     TIME("missed_by", "missed").if_known,
@@ -325,6 +329,7 @@ class ComparedThing:
         after: where it was in the later window; None if it was not seen then.
         missed: when it was not seen where expected.
         looks: detector messages that should have had it.
+        id: as of `Thing`.
     """
 
     label: str
@@ -332,6 +337,7 @@ class ComparedThing:
     after: ThingStay | None
     missed: Ns | None = None
     looks: int = 0
+    id: str = ""
 
 
 _MOVER: Final = an_object(

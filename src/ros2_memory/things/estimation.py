@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import STOREY_MM, Score, Spot
+from ros2_memory.analysis.sights import STOREY_MM, Score, Spot, apart_m
 from ros2_memory.core.arrays import (
     Flags,
     Ints,
     bounds_of,
+    concatenated,
     distinct_rows,
     in_ranges,
     range_numbers,
@@ -28,6 +29,7 @@ from ros2_memory.core.arrays import (
     stable_order,
 )
 from ros2_memory.things.blindness import without_blind_looks
+from ros2_memory.things.identity import lasting_ids
 from ros2_memory.things.instances import (
     Estimate,
     Instance,
@@ -97,6 +99,7 @@ def estimate(
         rows = np.concatenate([stay.spots for stay in instance.stays])
         label_counts = count_labels(sights, observed.counts, rows)
         instance.labels = count_names(label_counts, labels, names)
+        instance.id = sights.ids[instance.stays[0].id]
     instances.sort(key=lambda thing: (thing.label, thing.stays[0].first, thing.stays[0].x))
     counting = np.flatnonzero(sights.scores[:, Score.BIN] >= lowest_bin(min_score))
     scores = (sights.scores[counting, name] for name in Score)
@@ -174,11 +177,16 @@ def _add_places(groups: Sequence[LabelGroup], observed: Observations) -> None:
         if moves_by_itself(group.key):
             continue
         observed.go_on()
-        for rows, is_shared in _places_of_group(group, observed):
-            if is_shared:
-                group.places.append(rows)
-            elif observed.counts[rows].sum() >= FEWEST:
-                single.append((group, rows))
+        there = [*_places_of_group(group, observed)]
+        rows = concatenated(rows for rows, _ in there)
+        observed.ids[rows] = lasting_ids(observed.sights, rows, [len(part) for part, _ in there])
+        for rows, is_shared in there:
+            for number in np.unique(observed.ids[rows]).tolist():
+                part = rows[observed.ids[rows] == number]
+                if is_shared and not number:
+                    group.places.append(part)
+                elif observed.counts[part].sum() >= FEWEST:
+                    single.append((group, part))
     if not single:
         return
     thing = range_numbers([len(rows) for _, rows in single])
@@ -284,7 +292,11 @@ def _link(group: LabelGroup, observed: Observations) -> list[Instance]:
     if not group.stays:
         return []
     instances = _chain_stays(group, group.stays, proven=True)
-    if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
+    if any(
+        apart_m(thing.stays[0].at, stay.at) * 1000 > GATE_MM
+        for thing in instances
+        for stay in thing.stays
+    ):
         unproven = _chain_stays(group, group.stays, proven=False)
         parts = _split_around_others(group.stays, observed)
         split = _chain_stays(group, parts, proven=False)
@@ -304,9 +316,10 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
     stays = sorted(stays, key=lambda stay: stay.firm_first)
     seen_near = np.array([*_seen_near(stays)])
     integers = [
-        (stay.first, stay.last, stay.firm_last, stay.place, stay.side_by_side) for stay in stays
+        (stay.first, stay.last, stay.firm_last, stay.place, stay.side_by_side, stay.id)
+        for stay in stays
     ]
-    first, last, firm_last, place, beside = np.array(integers, np.int64).T
+    first, last, firm_last, place, beside, ids = np.array(integers, np.int64).T
     x, y, z = _middles(stays)
     was_left = np.array([stay.left is not None for stay in stays])
     newest = np.zeros(len(stays), np.int64)  # by thing, the number of its newest stay
@@ -314,10 +327,11 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
         lasts = newest[: len(instances)]
         is_near = np.hypot(x[lasts] - x[number], y[lasts] - y[number]) <= GATE_MM
         is_near &= np.abs(z[lasts] - z[number]) <= STOREY_MM
-        # It was seen to end, or is so near that both would be seen together.
-        has_ended = was_left[lasts] | is_near & (last[lasts] <= first[number])
+        # It was seen to end, or is so near that both would be seen together, or has the same id.
+        has_ended = was_left[lasts] | is_near & (last[lasts] <= first[number]) | (stay.id > 0)
         if not proven:
             has_ended |= beside[lasts] <= beside[number]
+        has_ended &= ids[lasts] == stay.id
         ended = np.flatnonzero(has_ended & (firm_last[lasts] <= stay.firm_first))
         thing = len(instances)
         if len(ended):
@@ -348,11 +362,6 @@ def _seen_near(stays: Sequence[PlacedStay]) -> Iterator[Ns]:
         is_near = np.hypot(x[beside] - x[nth], y[beside] - y[nth]) <= GATE_MM
         is_near &= np.abs(z[beside] - z[nth]) <= STOREY_MM
         yield int(begun[beside[is_near]].max(initial=begun[nth]))
-
-
-def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
-    is_above = abs(one.z - other.z) > STOREY_MM
-    return is_above or math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
 
 
 def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:

@@ -353,7 +353,7 @@ class _Finder:
         """Yields the things with one of the keys; without keys, all things."""
         estimate = self.known.estimate
         for instance in estimate.instances:
-            own_keys = self._keys_of(instance.labels)
+            own_keys = self._keys_of((*instance.labels, instance.id))
             if not keys or not own_keys.isdisjoint(keys):
                 yield from self._locate_instance(instance, own_keys)
         for mover in estimate.movers:
@@ -474,6 +474,7 @@ class _Finder:
             misread.update(stay.misread_as)
         return replace(
             shown,
+            id=instance.id,
             labels=tuple(labels.items()) if len(labels) > 1 else (),
             misread_as=_commonest(misread, instance.labels),
             spread_m=newest.stay.dev_mm / _MM,

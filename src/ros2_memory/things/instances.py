@@ -59,6 +59,7 @@ class PlacedStay:
             the detections beyond doubt.
         count: how many detections.
         side_by_side: how many things of the label stand there, by most of the stay.
+        id: the number of the id in `JoinedSights.ids`; 0 for none.
         misread_as: how often it was seen under the labels of other things.
     """
 
@@ -76,6 +77,7 @@ class PlacedStay:
     firm_last: Ns
     count: int
     side_by_side: int
+    id: int
     misread_as: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -102,6 +104,13 @@ class Instance:
     """When the chance that all of them missed it fell below 1 %; None if it never did."""
     labels: Mapping[str, int] = field(default_factory=dict)
     """How often it was seen under each name, the commonest first."""
+    id: str = ""
+    """What detectors tell it by from others of its label, over sessions."""
+
+    @property
+    def kind(self) -> tuple[str, int, str]:
+        """What it shares with the things that may be the same."""
+        return self.key, self.epoch, self.id
 
     @property
     def label(self) -> str:
@@ -275,12 +284,12 @@ class Estimate:
 
     def look_alikes(self, moves: Iterable[Move]) -> Iterator[tuple[Move, int]]:
         """Yields moves, each with how many other things of the label may be the one that moved."""
-        things_of: defaultdict[tuple[str, int], list[Instance]] = defaultdict(list)
+        things_of: defaultdict[tuple[str, int, str], list[Instance]] = defaultdict(list)
         for thing in self.instances:
-            things_of[thing.key, thing.epoch].append(thing)
-        stays_of: dict[tuple[str, int], _StayColumns] = {}
+            things_of[thing.kind].append(thing)
+        stays_of: dict[tuple[str, int, str], _StayColumns] = {}
         for move in moves:
-            kind = move.thing.key, move.thing.epoch
+            kind = move.thing.kind
             if kind not in stays_of:
                 stays_of[kind] = _StayColumns.of(things_of[kind])
             is_other = np.array([thing is not move.thing for thing in things_of[kind]])

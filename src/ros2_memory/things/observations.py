@@ -52,6 +52,8 @@ class Observations:
         fields: the field of view of each topic; see `_fields_of_view`.
         side: for each spot, the mean of the unit vectors to it from where it was seen; 0 if that
             is unknown.
+        ids: the id by which each spot is told from others of its label, as `_add_places` found it;
+            0 for none.
         go_on: as in `estimate`.
     """
 
@@ -68,6 +70,7 @@ class Observations:
         goes = np.array([moves_by_itself(key) for key in keys], np.bool_)[spots[:, Spot.LABEL]]
         self.carried = _carried_spots(sights) & ~goes
         self.counts[self.carried] = 0
+        self.ids = np.zeros(len(spots), np.int64)
         self.poor, poor_looks = _poorly_localised(sights)
         # Which hits are of detections that count is not known: as many in proportion, rounded up.
         spot, look, n = (sights.hits[:, name] for name in Hit)

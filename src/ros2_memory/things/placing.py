@@ -356,6 +356,8 @@ def _sights_of(topic: str, messages: Detected, frames: FrameTree, robot: Floats)
         names=found.labels.words,
         places=_places_in_target(messages, frames),
         scores=found.scores,
+        ids=found.ids.codes.astype(np.int64),
+        id_names=found.ids.words,
     )
     return sights_of(topic, seen)
 

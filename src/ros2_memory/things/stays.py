@@ -131,8 +131,8 @@ def placed_stays(
     firm_first = np.minimum.reduceat(np.where(is_firm, first, MAX_NS), begins)
     firm_last = np.maximum.reduceat(np.where(is_firm, last, -MAX_NS), begins)
     first, last = np.minimum.reduceat(first, begins), np.maximum.reduceat(last, begins)
-    beside = _side_by_side(spots, stay_of)
-    columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count, beside)
+    beside, ids = _side_by_side(spots, stay_of), observed.ids[rows[begins]]
+    columns = (x, y, z, dev_mm, first, last, firm_first, firm_last, count, beside, ids)
     placed = []
     numbers = zip(*(column.tolist() for column in columns), strict=True)
     for stay, own_rows, row in zip(stays, np.split(rows, begins[1:]), numbers, strict=True):
@@ -228,12 +228,13 @@ class _HostSearch:
                 stay.stay.first_slice,
                 stay.stay.last_slice,
                 stay.is_weak,
+                stay.id,
             )
             for group, stay in stays
         ]
-        columns = np.array(integers, np.int64).reshape(-1, 8).T
+        columns = np.array(integers, np.int64).reshape(-1, 9).T
         self._key, self._epoch, self._count, self._first, self._last = columns[:5]
-        self._first_slice, self._last_slice, self._is_weak = columns[5:]
+        self._first_slice, self._last_slice, self._is_weak, self._id = columns[5:]
         places = np.array([(stay.x, stay.y, stay.z, stay.dev_mm) for _, stay in stays], np.float64)
         *self._places, self._dev_mm = places.reshape(-1, 4).T
         self._by_x = stable_order(self._places[0])
@@ -306,4 +307,7 @@ class _HostSearch:
         is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
         is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
         is_near &= (self._epoch[other] == self._epoch[one]) & (self._is_weak[other] == 0)
+        # What has another id is no noise.
+        is_alike = (self._id[one] == 0) | (self._id[other] == self._id[one])
+        is_near &= is_alike | (self._key[other] != self._key[one])
         return one[is_near], other[is_near], away[is_near]

@@ -457,11 +457,11 @@ def scatter_notes(stays: Iterable[tuple[Instance, PlacedStay]]) -> Iterator[str]
 
     Each thing comes with its stay. Those of different runs of odometry cannot be compared.
     """
-    alike: dict[tuple[str, int], list[PlacedStay]] = defaultdict(list)
+    alike: dict[tuple[str, int, str], list[PlacedStay]] = defaultdict(list)
     for thing, stay in stays:
-        alike[thing.label, thing.epoch].append(stay)
+        alike[thing.label, thing.epoch, thing.id].append(stay)
     nearest: dict[str, tuple[float, float]] = {}
-    for (label, _), stays_of_label in alike.items():
+    for (label, *_), stays_of_label in alike.items():
         for one, other in combinations(stays_of_label, 2):
             away_m = math.dist(one.at, other.at)
             spread_m = max(one.dev_mm, other.dev_mm) / 1000
@@ -642,6 +642,8 @@ def _notes_on_labels(known: KnownThings, question: ThingsQuestion) -> Iterator[s
         about = f"{abbreviate(label)}: " if len(labels) > 1 else ""
         if key in in_window:
             notes = _detection_notes(known, question, key, in_window[key], in_all.get(key))
+        elif key in question.found:  # an id
+            continue
         else:
             notes = iter(too_many) if too_many else _similar_labels(known, key, label)
         for note in notes:

@@ -273,6 +273,7 @@ def listed(found: Detections, step: float) -> list[tuple[int | str, ...]]:
         found.rows.tolist(),
         found.labels.values(),
         found.frames.values(),
+        found.ids.values(),
         rounded(found.scores, step).tolist(),
         rounded(found.places, step).tolist(),
     )
@@ -282,11 +283,11 @@ def listed(found: Detections, step: float) -> list[tuple[int | str, ...]]:
         return "0" if abs(number) < 1e-12 else f"{number:.12g}"
 
     rows: list[tuple[int | str, ...]] = []
-    for row, label, frame, score, place in zip(*columns, strict=True):
+    for row, label, frame, own_id, score, place in zip(*columns, strict=True):
         where = [said(axis) for axis in place]
         # A point of zeros is not filled in.
         where = [] if {*where} <= {"0", "nan"} else where
-        rows.append((row, label, frame if where else "", said(score), *where))
+        rows.append((row, label, frame if where else "", own_id, said(score), *where))
     return sorted(rows)
 
 

@@ -39,10 +39,10 @@ STAMPED: JsonValue = {"header": {"frame_id": "map"}, "pose": AT}
                 "id": "3",
                 "bbox3d": {"center": AT, "frame_id": "base_link"},
             },
-            CUP._replace(frame_id="base_link"),
+            CUP._replace(frame_id="base_link", id="3"),
         ),
         ({"class_id": 41, "score": 0.5, "pose": AT}, CUP._replace(label="41")),
-        ({"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, CUP._replace(label="7")),
+        ({"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, CUP._replace(label="7", id="7")),
         ({"label": "cup", "score": 0.5, "pose": STAMPED}, CUP._replace(frame_id="map")),
         # JSON of ultralytics, and with a flat place
         ({"name": "cup", "class": 41, "confidence": 0.5, "pose": FLAT}, CUP),
@@ -69,12 +69,12 @@ STAMPED: JsonValue = {"header": {"frame_id": "map"}, "pose": AT}
         # Without a label: isaac_ros_apriltag_interfaces, aruco_opencv_msgs, darknet_ros_msgs
         (
             {"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}},
-            Detection("7", PLACE, "camera"),
+            Detection("7", PLACE, "camera", id="7"),
         ),
         ({"marker_id": 7, "pose": AT}, Detection("7", PLACE, "camera")),
         (
             {"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41},
-            Detection("cup", None, "camera", 0.5),
+            Detection("cup", None, "camera", 0.5, "41"),
         ),
     ],
 )

@@ -53,6 +53,8 @@ def estimated(*messages: Seen) -> Estimate:
         labels.words,
         np.array([place for *_, place in every]),
         np.full(len(every), math.nan),
+        np.zeros(len(every), np.int64),
+        ("",),
     )
     return estimate(whole([sights_of("/detections", seen)]), LABELS)
 
