@@ -9,6 +9,7 @@ pets, or one whose stays are many and short, moves by itself.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import replace
 from itertools import groupby
 from operator import itemgetter
@@ -39,7 +40,7 @@ from ros2_memory.things.instances import (
     count_labels,
     count_names,
 )
-from ros2_memory.things.labels import Labels, moves_by_itself
+from ros2_memory.things.labels import STATES, Labels, moves_by_itself
 from ros2_memory.things.observations import FEWEST, Observations, lowest_bin
 from ros2_memory.things.places import GATE_MM, MAX_PLACES, MIDDLE, places_of, stays_in
 from ros2_memory.things.presence import Evidence, evidence_at, stays_at
@@ -141,6 +142,7 @@ def _linked_things(
     """Returns the instances that explain the stays of each group, and the labels that move."""
     instances: list[Instance] = []
     movers: list[Mover] = []
+    _mark_changed_states(groups)
     for group in groups:
         observed.go_on()
         linked = _link(group, observed)
@@ -154,6 +156,22 @@ def _linked_things(
         if counts[counts >= FEWEST].sum() >= _FEWEST_OF_MOVERS:
             movers.append(Mover(group.key, group.epoch, group.rows))
     return instances, movers
+
+
+def _mark_changed_states(groups: Sequence[LabelGroup]) -> None:
+    """Marks the stays that end in another state of the thing; see `PlacedStay.has_changed`."""
+    of_kind: defaultdict[tuple[str, int], list[tuple[str, PlacedStay]]] = defaultdict(list)
+    for group in groups:
+        kind, _, state = group.key.rpartition(" ")
+        if kind and state in STATES:
+            of_kind[kind, group.epoch] += ((state, stay) for stay in group.stays)
+    for stays_of_kind in of_kind.values():
+        states, stays = zip(*stays_of_kind, strict=True)
+        (x, y, _), first = _middles(stays), np.array([stay.first for stay in stays])
+        for state, stay in stays_of_kind:
+            is_after = (np.array(states) != state) & (first > stay.last)
+            is_after &= np.hypot(x - stay.x, y - stay.y) <= GATE_MM
+            stay.has_changed = bool(is_after.any())
 
 
 def _evidence_of(
@@ -322,6 +340,7 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
     first, last, firm_last, place, beside, ids = np.array(integers, np.int64).T
     x, y, z = _middles(stays)
     was_left = np.array([stay.left is not None for stay in stays])
+    has_changed = np.array([stay.has_changed for stay in stays])
     newest = np.zeros(len(stays), np.int64)  # by thing, the number of its newest stay
     for number, stay in enumerate(stays):
         lasts = newest[: len(instances)]
@@ -331,7 +350,7 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
         has_ended = was_left[lasts] | is_near & (last[lasts] <= first[number]) | (stay.id > 0)
         if not proven:
             has_ended |= beside[lasts] <= beside[number]
-        has_ended &= ids[lasts] == stay.id
+        has_ended &= (ids[lasts] == stay.id) & (is_near | ~has_changed[lasts])
         ended = np.flatnonzero(has_ended & (firm_last[lasts] <= stay.firm_first))
         thing = len(instances)
         if len(ended):
@@ -389,6 +408,7 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) ->
         sizes = np.diff([0, *cuts, len(rows)])
         split = placed_stays(observed, [whole] * len(sizes), rows, sizes)
         split[0].misread_as = stay.misread_as
+        split[-1].has_changed = stay.has_changed
         parts += split
     return parts
 

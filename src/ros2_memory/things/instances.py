@@ -61,6 +61,8 @@ class PlacedStay:
         side_by_side: how many things of the label stand there, by most of the stay.
         id: the number of the id in `JoinedSights.ids`; 0 for none.
         misread_as: how often it was seen under the labels of other things.
+        has_changed: whether the thing is seen there later in another state, as a door that was
+            opened: then it went nowhere.
     """
 
     spots: Ints
@@ -79,6 +81,7 @@ class PlacedStay:
     side_by_side: int
     id: int
     misread_as: Counter[str] = field(default_factory=Counter)
+    has_changed: bool = False
 
     @property
     def place(self) -> int:

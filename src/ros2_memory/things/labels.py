@@ -95,6 +95,24 @@ _MOVES_BY_ITSELF: Final = frozenset(
 )
 _NO_ANIMALS: Final = frozenset({"hot dog", "corn dog", "rocking horse"})
 """Keys that end in a word for an animal, and name a thing."""
+STATES: Final = frozenset(
+    {
+        "ajar",
+        "closed",
+        "down",
+        "empty",
+        "full",
+        "locked",
+        "off",
+        "on",
+        "open",
+        "opened",
+        "shut",
+        "unlocked",
+        "up",
+    }
+)
+"""Last words of labels that say how a thing is: "door open"."""
 _NO_PLURALS: Final = ("ss", "us", "is")
 _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 

@@ -86,6 +86,22 @@ def test_alike_things_that_two_detectors_see_do_not_stand_together(tmp_path: Pat
     assert not [thing for thing in found["things"] if "at_once" in thing]
 
 
+def test_a_door_that_was_closed_while_another_was_opened_is_not_the_other(tmp_path: Path) -> None:
+    """One of the boxes was carried to where the other was, and both may be empty."""
+
+    def seen(left: str, right: str) -> list[Seen]:
+        return [(left, 3.0, 1.5), (right, 3.0, -1.5)]
+
+    before = [*seen("door_open", "door_closed"), ("box 7", 4.0, 1.5), ("box 8", 4.0, -1.5)]
+    after = [*seen("door_closed", "door_open"), ("box 8", 4.0, 1.5), ("box 7", 4.0, -1.5)]
+    reply = compared(tmp_path, [*looked(0, 30, HERE, *before), *looked(60, 90, HERE, *after)])
+    assert {kind: sorted(of_kind) for kind, of_kind in labels(reply).items()} == {
+        "moved": ["box 7", "box 8"],
+        "appeared": ["door closed", "door open"],
+        "not_seen_where_expected": ["door closed", "door open"],
+    }
+
+
 def test_of_two_that_stood_together_one_is_missing_where_the_other_is_now(tmp_path: Path) -> None:
     two, one = [("cup", 3.0, 0.0), ("cup", 3.0, 0.25)], ("cup", 3.0, -1.5)
     reply = compared(tmp_path, [*looked(0, 30, HERE, *two), *looked(60, 90, HERE, one)])
