@@ -370,7 +370,11 @@ def notes_on(view: View, known: KnownThings, question: ThingsQuestion) -> Iterat
         yield from _low_score_notes(known, question)
     yield from _notes_on_labels(known, question)
     if _rows_during(question.window, known.estimate.unplaced, Unplaced.FIRST, Unplaced.LAST).size:
-        yield from unknown_path(view)
+        notes = [*unknown_path(view)]
+        if not (notes or view.moving_topics):
+            topics = listed(view.limits.tf_topics) or "data.tf_topics"
+            notes = [f"what is detected is placed by transforms, of which {topics} has none here"]
+        yield from notes
 
 
 def _low_score_notes(known: KnownThings, question: ThingsQuestion) -> Iterator[str]:

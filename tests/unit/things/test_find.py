@@ -215,6 +215,13 @@ def test_where_the_robots_poses_are_to_be_chosen_unplaced_detections_say_so(tmp_
     ]
 
 
+def test_where_no_transforms_are_recorded_unplaced_detections_say_so(tmp_path: Path) -> None:
+    messages = looked(0, 30, HERE, ("cup", 3.0, 0.0))
+    reply = told_of(tmp_path, [each for each in messages if "/tf" not in each.topic], label="cup")
+    assert reply["total"] == 0
+    assert "what is detected is placed by transforms, of which /tf has none here" in reply["notes"]
+
+
 @pytest.mark.parametrize(("noise_m", "is_told"), [(0.5, True), (0.02, False)])
 def test_things_that_are_nearer_to_each_other_than_noise_throws_detections_are_told(
     tmp_path: Path, noise_m: float, is_told: bool
