@@ -219,7 +219,7 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
         said = ((10, "CHARGING"), (400, "SCOUTING"), (700, "CHARGING"))
         states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said]
         messages = [odom(T0 + (begin + at) * S, 0.0) for at in range(0, 1001, 2)]
-        write_splits(tmp_path, [*states, *messages], 10, f"run{begin}")
+        write_splits(tmp_path, [*states, *messages], 100, f"run{begin}")
     given = {"topic": "/mission", "condition_type": "equals", "value": "CHARGING", "by": "day"}
     memory = memory_of(tmp_path, recalls=recalls)
     whole = table(asked(memory, "find_matches", **given))["all"]

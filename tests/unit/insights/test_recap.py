@@ -138,7 +138,7 @@ def test_an_error_that_comes_again_long_after_is_another_event(
     """It is reported once a minute twice, in two rooms."""
     often = [log_entry(at(t), 40, "brush", "stalled") for t in (5, 65, 605, 2400, 2460)]
     poses = [odom(at(t), 0.0 if t < 1200 else 5.0) for t in range(0, 2500, 5)]
-    write_splits(tmp_path, in_order([*often, *poses]))
+    write_splits(tmp_path, in_order([*often, *poses]), 600)
     memory = memory_of(tmp_path, recalls=recalls)
     reply = asked(memory, "recap", start=T0, end=T0 + 2500)
     errors = [each for each in reply["events"] if each["text"].startswith("error")]
