@@ -86,10 +86,10 @@ class Circle:
         dx, dy = steps.moved
         px, py = steps.x - self.x, steps.y - self.y
         a = dx * dx + dy * dy
-        b = px * dx + py * dy
-        c = px * px + py * py - self.radius_m * self.radius_m
         moves = a > 0
-        with np.errstate(over="ignore", invalid="ignore"):  # a radius may be 1e308
+        with np.errstate(over="ignore", invalid="ignore"):  # x, y and the radius may be 1e308
+            b = px * dx + py * dy
+            c = px * px + py * py - self.radius_m * self.radius_m
             discriminant = b * b - a * c
         root = np.sqrt(np.maximum(discriminant, 0.0))
         divisor = np.where(moves, a, 1.0)

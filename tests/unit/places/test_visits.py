@@ -294,6 +294,13 @@ def test_a_fault_of_a_node_holds_from_its_message_to_its_next_one_while_others_a
         assert [row["first_seen"] - T0 for row in found["sightings"]] == [80, 60, 40, 20]
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_place_beyond_all_others_is_answered_without_a_warning(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    assert asked(memory, "visits", x=1e308, y=-1e308, radius_m=1e308)["total"] == 0
+    assert asked(memory, "visits", x=0, y=0, radius_m=1e308)["total"] == 1
+
+
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
     Place("start", "map", Rectangle(-0.6, 0.6, -0.6, 0.6)),
