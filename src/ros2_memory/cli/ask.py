@@ -126,7 +126,7 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(with_plain_numbers(answer, is_recorded=name == _QUERY_LAKE))
+        print_reply(with_plain_numbers(answer, name == _QUERY_LAKE))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 

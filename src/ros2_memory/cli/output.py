@@ -35,6 +35,8 @@ _LEAST_WIDTH: Final = 12
 _EARLIEST_TIME: Final = 1e9
 _LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
+_RECORDED: Final = ("value", "min", "max")
+"""Keys of what messages contain, which may be any number."""
 
 
 def print_line(line: str) -> None:
@@ -135,7 +137,12 @@ def _with_rows_as_objects(reply: Mapping[str, JsonValue]) -> JsonObject:
     if not isinstance(columns, list) or not isinstance(rows, list):
         return {**reply}
     names = [*map(str, columns)]
-    cells_by_row = (row for row in rows if isinstance(row, list))
+    is_recorded = [not (name == "timestamp" or name.endswith("_unix")) for name in names]
+    if isinstance(total := rest.get("all"), list):  # without the cell of the bin
+        rest["all"] = [*map(with_plain_numbers, total, is_recorded[1:])]
+    cells_by_row = (
+        map(with_plain_numbers, row, is_recorded) for row in rows if isinstance(row, list)
+    )
     return rest | {"rows": [dict(zip(names, cells, strict=False)) for cells in cells_by_row]}
 
 
@@ -169,18 +176,18 @@ def filled_leaves(value: JsonValue) -> dict[str, JsonValue]:
     return {path: inner for path, inner in leaves(value) if inner != {}}
 
 
-def with_plain_numbers(value: JsonValue, *, is_recorded: bool = True) -> JsonValue:
+def with_plain_numbers(value: JsonValue, is_recorded: bool = True) -> JsonValue:
     """Returns a value whose recorded floats are texts, since one may seem a time.
 
-    All of a value that `is_recorded`; of a reply those below the key `value`.
+    All of a value that `is_recorded`; of a reply those below the keys `_RECORDED`.
     """
     if isinstance(value, float):
         return f"{value:.15g}" if is_recorded else value
     if isinstance(value, list):
-        return [with_plain_numbers(inner, is_recorded=is_recorded) for inner in value]
+        return [with_plain_numbers(inner, is_recorded) for inner in value]
     if isinstance(value, dict):
         return {
-            key: with_plain_numbers(inner, is_recorded=is_recorded or key == "value")
+            key: with_plain_numbers(inner, is_recorded or key in _RECORDED)
             for key, inner in value.items()
         }
     return value

@@ -362,9 +362,12 @@ def test_a_recorded_number_is_no_time_however_large(tmp_path: Path, exits: Progr
     for line in (
         f"get_topic_at_time topic=/free timestamp={T0 // NS_PER_S}",
         "get_topic_in_last topic=/free seconds=9",
+        "get_topic_in_last topic=/free seconds=9 fields=data",
+        "get_topic_in_last topic=/free seconds=9 fields=data by=hour",
     ):
         printed = exits(0, "ask", *line.split(), tmp_path).out
         assert "2147483648.5" in printed
+        assert "2038" not in printed
         assert format_time(T0 / NS_PER_S) in printed
 
 
