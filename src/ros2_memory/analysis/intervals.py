@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 
 SILENCE_NS: Final = 10 * NS_PER_S
 """After so long without a message an object is gone: many detectors publish only what they see."""
+PACED: Final = 20
+"""A topic is regular or not only if it has so many messages."""
+_REGULAR: Final = 1.05
+"""A topic is regular if one pause in twenty is at most so many times as long as one in four."""
 THINNED_NS: Final = 7 * NS_PER_S
 """In a thinned day each topic keeps a message this often, if it had one."""
 FLICKER_NS: Final = 3 * NS_PER_S
@@ -64,6 +68,18 @@ _FROM_START: Final = 1
 """Flag of `ends`: the first of all messages contains the object."""
 _TO_END: Final = 2
 """Flag of `ends`: the last of all messages contains the object."""
+
+
+def pause_of(times: Ints) -> Ns:
+    """Returns after how long a pause (ns) a topic with messages at some log times is silent.
+
+    That is `SILENCE_NS`, but one and a half periods of a topic that is regularly published more
+    seldom, as a battery is, or about as often: else each message would be a state of its own.
+    """
+    if times.size < PACED:
+        return SILENCE_NS
+    often, seldom = np.quantile(np.diff(times), (0.75, 0.95))
+    return max(SILENCE_NS, int(1.5 * often)) if seldom <= _REGULAR * often else SILENCE_NS
 
 
 def pieces_of(starts: Ints, stops: Ints, silence_ns: Ns = SILENCE_NS) -> tuple[Ints, Ints]:

@@ -3,7 +3,7 @@
 When a rule fires is a fold over messages in order of time, with its state carried on.
 
 A match begins with a message that meets the condition. It ends as a sighting does: with a message
-of the topic that does not meet it, or when the topic is silent for longer than `SILENCE_NS`. On a
+of the topic that does not meet it, or when the topic is silent for longer than its `pause_of`. On a
 latched topic, whose publisher sends only when something changes, a silence ends nothing. A match
 also ends at a gap, where the recorder did not run. A message that cannot be decoded neither begins
 nor ends a match.
@@ -22,19 +22,23 @@ from __future__ import annotations
 import hashlib
 import heapq
 import time
+from collections import defaultdict, deque
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.analysis.facts import source_of
-from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.intervals import PACED, SILENCE_NS, pause_of
 from ros2_memory.analysis.refusals import refusal_for
 from ros2_memory.bag_dir.layout import named_start, split_number
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import COMPRESSED, BagFile, JsonValue, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
@@ -112,6 +116,7 @@ class Rule:
         *,
         matches: bool | None,
         latched: bool = False,
+        pause: Ns = SILENCE_NS,
     ) -> Firing | None:
         """Updates `runs` by the next message of a topic; returns whether the rule fires.
 
@@ -122,6 +127,7 @@ class Rule:
             time: the log time of the message.
             matches: whether the message meets the condition; None if it cannot be decoded.
             latched: whether the value of the message holds until the next one.
+            pause: the longest pause before the message in which a match goes on.
         """
         run = runs.get(topic)
         if run is not None and time < run.last - SILENCE_NS:
@@ -134,7 +140,7 @@ class Rule:
         if run is not None and run.lasts:
             # The value held until now, whatever it is from now on.
             fired = self._fire(topic, run, time)
-        elif run is not None and abs(time - run.last) > SILENCE_NS:
+        elif run is not None and abs(time - run.last) > pause:
             run = None
         if matches is False:
             run = None
@@ -172,13 +178,6 @@ def _source_of(event: _Event, value: JsonValue | UndecodableError) -> str:
         return event.topic
     source = source_of(value, event.record.channel.type)
     return f"{event.topic} {source}" if source else event.topic
-
-
-def _drop_ended(runs: MutableMapping[str, RunRecord], begin: str, time: Ns) -> None:
-    """Drops the matches of nodes that are silent, by the begin of their names: none goes on."""
-    for name, run in [*runs.items()]:
-        if name.startswith(begin) and not run.lasts and time - run.last > SILENCE_NS:
-            del runs[name]
 
 
 class SearchPart(NamedTuple):
@@ -339,6 +338,8 @@ class SplitSearch:
         self._rules = [rule for rule in self.rules if rule.kind != "recorder_restart"]
         self._rules_of = cache(self._find_rules)
         self._tested: set[tuple[str, str]] = set()
+        # By `_source_of`, the log times of its newest messages.
+        self._times = defaultdict[str, deque[Ns]](lambda: deque(maxlen=PACED))
 
     def search(
         self, chain: SearchChain, state: TriggerState, is_over: Callable[[], bool]
@@ -389,17 +390,39 @@ class SplitSearch:
                     value = self.extractor.exact(self.reader.decode(record), record.channel.type)
                 except UndecodableError as error:
                     value = error
+        said_by = _source_of(event, value)
+        pause = self._pause_before(said_by, event.time)
+        times = self._times[said_by]
+        # Recordings that take over from each other both have some.
+        if not times or abs(event.time - times[-1]) > COPY_HORIZON_NS:
+            times.append(event.time)
         for rule in rules:
             if latched and rule.kind == "silent":
                 continue  # its publisher is silent until something changes
             matches = None if record is None else self._test(rule, record.channel, value, state)
             runs = state.rules[rule.name].runs
-            source = event.topic if rule.kind == "silent" else _source_of(event, value)
+            source = event.topic if rule.kind == "silent" else said_by
             if source != event.topic:
-                _drop_ended(runs, f"{event.topic} ", event.time)
-            fired = rule.take(runs, source, event.time, matches=matches, latched=latched)
+                self._drop_ended(runs, f"{event.topic} ", event.time)
+            fired = rule.take(
+                runs, source, event.time, matches=matches, latched=latched, pause=pause
+            )
             if fired is not None:
                 yield fired
+
+    def _pause_before(self, source: str, time: Ns) -> Ns:
+        """Returns through how long a pause before a message of a source its match goes on."""
+        times = self._times[source]
+        # Mostly it is shorter, and need not be computed.
+        is_long = times and time - times[-1] > SILENCE_NS
+        return pause_of(np.array(times, np.int64)) if is_long else SILENCE_NS
+
+    def _drop_ended(self, runs: MutableMapping[str, RunRecord], begin: str, time: Ns) -> None:
+        """Drops the matches of nodes that are silent, by the begin of their names: none goes on."""
+        for name, run in [*runs.items()]:
+            is_of_topic = name.startswith(begin) and not run.lasts
+            if is_of_topic and time - run.last > self._pause_before(name, time):
+                del runs[name]
 
     def _test(
         self, rule: Rule, channel: Channel, value: JsonValue | UndecodableError, state: TriggerState

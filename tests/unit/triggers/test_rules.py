@@ -214,6 +214,23 @@ def test_a_full_battery_does_not_end_the_low_charge_of_another_on_its_topic(
     assert robot.fired_at() == [8]
 
 
+@pytest.mark.parametrize(("hold_s", "fires_at"), [(0, [600]), (60, [660])])
+def test_a_battery_that_comes_every_twenty_seconds_is_low_once(
+    tmp_path: Path, hold_s: int, fires_at: list[float]
+) -> None:
+    """It fired for each of its messages, or never where it was to be low for a minute."""
+    low = parse_condition("below", 0.2, 0.5, "percentage")
+    held = rule(topic="/battery_state", condition=low, hold=hold_s * S)
+    robot = WatchedBags(tmp_path / "bags", [held])
+    robot.begin(T0)
+    for begin in range(0, 900, 60):
+        seconds = range(begin, begin + 60, 20)
+        robot.split([battery(T0 + at * S, 0.1 if at >= 600 else 0.3) for at in seconds])
+        robot.look()
+    robot.close_all()
+    assert robot.fired_at() == fires_at
+
+
 @pytest.mark.parametrize(("hold_s", "fires_at"), [(0, [5]), (3, [8]), (30, [])])
 def test_what_other_nodes_report_does_not_end_the_error_of_one(
     tmp_path: Path, hold_s: int, fires_at: list[float]
