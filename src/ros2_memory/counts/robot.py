@@ -179,6 +179,7 @@ def count_visits(
         _add_visits(binned, stays)
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
+    scope = scope.settled()
     # Two places may have one name.
     named_stays = [
         (place.name, _stays(view, place.frame_id, place.region, window, scope))

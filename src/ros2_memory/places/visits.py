@@ -150,8 +150,9 @@ def _visits_of_places(
     view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, scope: Scope, *, now: Ns
 ) -> Visits:
     """Returns how often and how long the robot was in each named place, the longest first."""
+    settled = scope.settled()
     stays_of_places = [
-        (place, ConfirmedStays(view, place.frame_id, place.region, window, scope))
+        (place, ConfirmedStays(view, place.frame_id, place.region, window, settled))
         for place, _ in places_in(view, view.limits.places, placement, window)
     ]
     rows = (confirmed.summary(place.name) for place, confirmed in stays_of_places)

@@ -354,6 +354,15 @@ class Scope:
             ]
         return wider
 
+    def settled(self) -> Scope:
+        """Returns a scope that tests its conditions now, and not for each question again."""
+        settled = copy(self)
+        if not self._states:
+            return settled
+        parts = self.parts_of(self.window.start, self.window.stop - 1)
+        settled._inside, settled._states = [(first, last + 1) for first, last in parts], []
+        return settled
+
     @property
     def compared_frames(self) -> tuple[str, ...]:
         """Notes on the frames in which the conditions compared positions."""
