@@ -29,7 +29,7 @@ from ros2_memory.analysis.topic_events import TopicEvents, joined_events, joined
 from ros2_memory.core.arrays import bounds_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, lies_inside, spans_of, united, without
+from ros2_memory.core.spans import Spans, spans_of, united, without
 from ros2_memory.core.text import Quoted, counted, listed, shortened
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
 from ros2_memory.counts.bins import HELD_COLUMNS, BinnedWindow, By
@@ -46,12 +46,10 @@ from ros2_memory.history.coverage import (
 )
 from ros2_memory.history.held_values import HeldValue, HeldValues
 from ros2_memory.history.lasting import (
-    held_times,
     held_until,
     holds_on,
     is_latched,
     is_text,
-    lasting_of,
 )
 from ros2_memory.history.no_data import matching_topics, no_value_between, require_recorded
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -60,7 +58,7 @@ from ros2_memory.history.view import ANY_TIME, TimeRange, View, clamped, open_se
 from ros2_memory.insights.sightings import SightingSpans, held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back, flags_before, message_before
 from ros2_memory.messages.detections import name_field
-from ros2_memory.places.where import Scope, Where, heard_times, parse_where
+from ros2_memory.places.where import Scope, Where, known_times, parse_where
 from ros2_memory.results import Bins
 from ros2_memory.things.unseen import notes_on_never
 
@@ -404,18 +402,9 @@ def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> S
     if not long:
         return []
     view, window = binned.view, TimeWindow(long[0].start, long[-1].stop + 1)
-    frequent = lasting_of(view, topic, states=True).frequent
-    lasts = united([*held_times(view, [topic], window), *frequent])
-    silences = without([(window.start, window.stop)], lasts)
-    heard = heard_times(view, (topic,), window) if frequent else ()
-    between = (
-        (last - 1, min(first, window.stop))
-        for (_, last), (first, _) in pairwise(heard)
-        # Outside of the window not every message is heard.
-        if lies_inside(frequent, last - 1) and window.contains(last - 1)
-    )
     # A thinned day has one message of a measurement a minute.
-    return [*silences, *without(between, view.timeline.thinned_times)]
+    known = [*known_times(view, [topic], window), *view.timeline.thinned_times]
+    return without([(window.start, window.stop)], united(known))
 
 
 def _heard_parts(span: _HeldSpan, unheard: Spans) -> list[_HeldSpan]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from bisect import insort
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -342,7 +341,7 @@ class HeldValues:
         """Ends what held before a message that cannot be decoded."""
         at = stored.time
         if at not in self._undecoded:
-            insort(self._lasting.breaks, at)
+            self._lasting.end_at(at)
             self._undecoded[at] = Note(UNDECODED, stored.topic, why, at, at)
 
     def _value_of(self, message: object, type_name: str) -> JsonValue:

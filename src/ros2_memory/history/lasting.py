@@ -7,19 +7,20 @@ It ends before that, in this order:
    boolean, a value, what `while` asks for). Else it is `SILENCE_NS`, or one and a half periods of a
    topic that is published regularly, if these are longer;
 2. where messages of the topic were deleted;
-3. without such a pause, where the clock was wrong; and unless the topic is latched, where another
-   run of the recorder begins, or the topic falls silent for longer than usual.
+3. in a pause of more than `SILENCE_NS`, at any other of its `breaks_of`: where the clock was wrong;
+   and unless the topic is latched, where another run of the recorder begins, or the topic falls
+   silent for longer than usual.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.intervals import PACED, SILENCE_NS, pause_of
 from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
@@ -39,12 +40,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
-_PACED: Final = 20
-"""A topic is regular or not in a session with so many messages."""
 _MOST_PACED: Final = 1000
 """The newest messages of a session that say whether a topic is regular."""
-_REGULAR: Final = 1.05
-"""A topic is regular if one pause in twenty is at most so many times as long as one in four."""
 
 
 class _Heard(NamedTuple):
@@ -62,10 +59,11 @@ class _Heard(NamedTuple):
     messages: int
 
 
+_NOWHERE: Final = _Heard(0, 0, is_frequent=False, messages=0)
 _HEARD: Final[Key[dict[str, list[_Heard]]]] = Key()
 """Of a timeline: by topic, the sessions that have it."""
-_PERIODS: Final[Key[dict[tuple[str, _Heard], Ns]]] = Key()
-"""Of a timeline: by topic and session, one and a half periods; 0 if it is not regular."""
+_PAUSES: Final[Key[dict[tuple[str, _Heard], Ns]]] = Key()
+"""Of a timeline: by topic and session, its `pause_of`."""
 _DELETIONS: Final[Key[dict[str, list[Ns]]]] = Key()
 """Of a view: by topic, its `deletions`."""
 
@@ -88,45 +86,41 @@ class Lasting:
     def __init__(
         self, view: View, topics: Collection[str], *, states: bool = True, texts: bool = False
     ) -> None:
-        self._view = view
-        self._states = states
+        self._view, self._topics = view, topics
         ending = [topic for topic in topics if not (texts and is_text(view, topic))]
-        self._heard = [(topic, heard) for topic in ending for heard in _heard_in(view, topic)]
+        self._heard = [heard for topic in ending for heard in _heard_in(view, topic)]
+        self._near = _NOWHERE  # the session of the last lookup
         may_last = states or all(is_latched(view, topic) for topic in topics)
         self.longest = MAX_NS if may_last else SILENCE_NS
-        self._edges = sorted({*chain.from_iterable(heard[:2] for _, heard in self._heard)})
-        self._pauses: dict[int, Ns] = {}
-        self.frequent = united(heard[:2] for _, heard in self._heard if heard.is_frequent)
-        breaks = {*chain.from_iterable(deletions(view, topic) for topic in topics)}
-        for topic in topics if may_last else ():
-            breaks.update(at for at in breaks_of(view, topic) if not lies_inside(self.frequent, at))
-        self.breaks = sorted(breaks)
+        self.frequent = united(heard[:2] for heard in self._heard if heard.is_frequent)
+        self.breaks = sorted({*chain.from_iterable(breaks_of(view, topic) for topic in topics)})
+        self._cuts = sorted(chain.from_iterable(deletions(view, topic) for topic in topics))
+
+    def end_at(self, at: Ns) -> None:
+        """Ends at a log time whatever was said before."""
+        insort(self.breaks, at)
+        insort(self._cuts, at)
 
     def pause(self, at: Ns) -> Ns:
         """Returns the longest pause (ns) through which a message at a log time lasts."""
-        return self._pause_at(bisect_right(self._edges, at))
-
-    def _pause_at(self, edge: int) -> Ns:
-        """Returns the shortest pause of the sessions that go on before an edge."""
-        if edge not in self._pauses:
-            at = self._edges[edge - 1] if edge else MIN_NS
-            now = [one for one in self._heard if one[1].start <= at < one[1].stop]
-            pauses = [self._pause_of(topic, heard) for topic, heard in now]
-            self._pauses[edge] = min(pauses, default=self.longest)
-        return self._pauses[edge]
-
-    def _pause_of(self, topic: str, heard: _Heard) -> Ns:
-        if heard.is_frequent:
+        if lies_inside(self.frequent, at):
             return SILENCE_NS
-        return MAX_NS if self._states else max(SILENCE_NS, _periods(self._view, topic, heard))
+        if self.longest == MAX_NS:
+            return MAX_NS
+        if not self._near.start <= at < self._near.stop:
+            near = (heard for heard in self._heard if heard.start <= at < heard.stop)
+            self._near = next(near, _NOWHERE)
+        [topic] = self._topics
+        return _pause_in(self._view, topic, self._near)
 
     def ends(self, times: Ints) -> Flags:
         """Returns for each log time but the last whether what was said ends before the next."""
-        edges, nth = np.unique(
-            np.searchsorted(self._edges, times[:-1], side="right"), return_inverse=True
-        )
-        pauses = np.array([self._pause_at(edge) for edge in edges.tolist()], np.int64)[nth]
-        return (np.diff(times) > pauses) | (np.diff(np.searchsorted(self.breaks, times)) > 0)
+        pauses = np.diff(times)
+        ended = np.diff(np.searchsorted(self._cuts, times)) > 0
+        for nth in np.flatnonzero(pauses > SILENCE_NS).tolist():
+            _, is_reached = self.until(*times[nth : nth + 2].tolist())
+            ended[nth] = not is_reached
+        return ended
 
     def until(self, last: Ns, following: Ns) -> tuple[Ns, bool]:
         """Returns until when a message lasts, and whether the next one ends it.
@@ -137,9 +131,10 @@ class Lasting:
         """
         if following - last > self.pause(last):
             return last, False
-        nth = bisect_left(self.breaks, last)
-        if nth < len(self.breaks) and self.breaks[nth] < following:
-            return self.breaks[nth], False
+        breaks = self.breaks if following - last > SILENCE_NS else self._cuts
+        nth = bisect_left(breaks, last)
+        if nth < len(breaks) and breaks[nth] < following:
+            return breaks[nth], False
         if following == MAX_NS:
             return max(last, self._view.snapshot.latest or last), False
         return following, True
@@ -173,20 +168,18 @@ def _heard_in(view: View, topic: str) -> list[_Heard]:
     return [] if is_latched(view, topic) else known[topic]
 
 
-def _periods(view: View, topic: str, heard: _Heard) -> Ns:
-    """Returns one and a half periods (ns) of a topic in a session; 0 if it is not regular there."""
-    known = view.timeline.memo.of(_PERIODS, dict)
+def _pause_in(view: View, topic: str, heard: _Heard) -> Ns:
+    """Returns the `pause_of` the newest messages of a topic in a session."""
+    known = view.timeline.memo.of(_PAUSES, dict)
     if (topic, heard) not in known:
-        parts: list[IntArray] = []
+        parts: list[IntArray] = [np.empty(0, np.int64)]
         window = TimeWindow(heard.start, heard.stop)
         scanned = open_scan(view, topic, window, columns=False).rows(newest_first=True)
-        for rows in scanned if heard.messages >= _PACED else ():
+        for rows in scanned if heard.messages >= PACED else ():
             parts.append(rows.times)
             if sum(map(len, parts)) > _MOST_PACED:
                 break
-        times = np.sort(np.concatenate(parts))[-_MOST_PACED:] if parts else np.zeros(2, np.int64)
-        often, seldom = np.quantile(np.diff(times), (0.75, 0.95))
-        known[topic, heard] = int(1.5 * often) if seldom <= _REGULAR * often else 0
+        known[topic, heard] = pause_of(np.sort(np.concatenate(parts))[-_MOST_PACED:])
     return known[topic, heard]
 
 

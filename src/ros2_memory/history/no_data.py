@@ -31,7 +31,7 @@ from ros2_memory.history.coverage import (
     was_removed,
     why_nothing,
 )
-from ros2_memory.history.lasting import is_text, still_holds
+from ros2_memory.history.lasting import held_at, is_text, still_holds
 from ros2_memory.index.file_state import HELD_BACK
 
 if TYPE_CHECKING:
@@ -408,11 +408,9 @@ def accepting(older: StoredMessage, at: Ns) -> str:
 def _may_hold_on(view: View, older: StoredMessage, at: Ns) -> bool:
     """Returns whether a message is a text that may hold until a later moment.
 
-    Such a topic says what a robot does when that changes, and nothing interrupted the recording.
+    Such a topic says what a robot does when that changes.
     """
-    pace = view.timeline.pace(older.topic, older.recording)
-    is_of_same_run = at <= pace.end and not view.gaps(TimeWindow(older.time + 1, at))
-    return is_text(view, older.topic) and pace.is_rare and is_of_same_run
+    return is_text(view, older.topic) and held_at(view, older.topic, at, states=True) is not None
 
 
 def _distances(

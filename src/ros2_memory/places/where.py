@@ -495,14 +495,8 @@ class _ConditionStates:
         self._read, self._met = TimeWindow(0, 0), Spans()
 
     def known_in(self, window: TimeWindow) -> Spans:
-        """Returns when it is known what the topics said.
-
-        What latched and rare topics said holds through silences; what others said does not.
-        """
-        topics, around = self.search.topics, window.widened(SILENCE_NS)
-        is_frequent = overlaps_any(self._lasting.frequent, around.start, around.stop)
-        heard = heard_times(self._view, topics, around) if is_frequent else []
-        return united([*held_times(self._view, topics, window), *heard])
+        """Returns when it is known what the topics said."""
+        return known_times(self._view, self.search.topics, window)
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message at a log time met the condition.
@@ -603,6 +597,17 @@ class _ConditionStates:
         stops = np.minimum(stops, ends[np.searchsorted(ends, times)] + 1)
         is_met = (tested.met == MET) & (stops > times)
         return spans_of(*pieces_of(times[is_met], stops[is_met], 0))
+
+
+def known_times(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
+    """Returns when in a window it is known what topics said.
+
+    What latched and rare topics said lasts through silences; what others said does not.
+    """
+    around = window.widened(SILENCE_NS)
+    is_frequent = overlaps_any(Lasting(view, topics).frequent, around.start, around.stop)
+    heard = heard_times(view, topics, around) if is_frequent else []
+    return united([*held_times(view, topics, window), *heard])
 
 
 def heard_times(view: View, topics: Collection[str], window: TimeWindow) -> Spans:

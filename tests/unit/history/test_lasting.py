@@ -19,6 +19,7 @@ def paced(pace: str, draw: Random) -> list[int]:
     """The seconds of a session's messages."""
     steps = {
         "often": [draw.choice([1, 1, 1, 1, 12]) for _ in range(40)],
+        "seldom": [7] * 25 + [15] + [7] * 5,
         "regular": [20] * 30,
         "slower": [45] * 25 + [100] + [45] * 5,
         "on change": [draw.choice([7, 30, 200, 900]) for _ in range(8)],
@@ -26,7 +27,7 @@ def paced(pace: str, draw: Random) -> list[int]:
     return [sum(steps[:nth]) for nth in range(len(steps) + 1)]
 
 
-LASTING_S = {"often": 10.0, "regular": 30.0, "slower": 67.5, "on change": 10.0}
+LASTING_S = {"often": 10.0, "seldom": 10.5, "regular": 30.0, "slower": 67.5, "on change": 10.0}
 """For how long at most a message of a measurement lasts."""
 
 
@@ -46,7 +47,7 @@ def expected(sessions: list[tuple[str, list[int]]], is_state: bool) -> Iterator[
 def test_each_session_says_for_how_long_its_messages_last(tmp_path: Path, seed: int) -> None:
     draw = Random(seed)
     sessions: list[tuple[str, list[int]]] = []
-    for nth, pace in enumerate(draw.sample([*LASTING_S], 4)):
+    for nth, pace in enumerate(draw.sample([*LASTING_S], len(LASTING_S))):
         times = [nth * DAY_S + at for at in paced(pace, draw)]
         sessions.append((pace, times))
         logged = [T0 + at * S for at in times]
@@ -68,7 +69,7 @@ def test_each_session_says_for_how_long_its_messages_last(tmp_path: Path, seed: 
     true = {"topic": "/bumper", "condition_type": "equals", "value": True}
     assert held(**true) == flags
     lengths = sum(last - first for first, last in flags)
-    window = {"start": T0 / S, "end": T0 / S + 4 * DAY_S}
+    window = {"start": T0 / S, "end": T0 / S + 5 * DAY_S}
     by_value = asked(memory, "get_topic_in_range", topic="/bumper", by="value", **window)
     assert [row[:3] for row in by_value["rows"]] == [["true", len(flags), lengths]]
     driven_so = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
