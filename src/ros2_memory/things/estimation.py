@@ -167,11 +167,10 @@ def _mark_changed_states(groups: Sequence[LabelGroup]) -> None:
             of_kind[kind, group.epoch] += ((state, stay) for stay in group.stays)
     for stays_of_kind in of_kind.values():
         states, stays = zip(*stays_of_kind, strict=True)
-        (x, y, _), first = _middles(stays), np.array([stay.first for stay in stays])
+        middles, first = _middles(stays), np.array([stay.first for stay in stays])
         for state, stay in stays_of_kind:
             is_after = (np.array(states) != state) & (first > stay.last)
-            is_after &= np.hypot(x - stay.x, y - stay.y) <= GATE_MM
-            stay.has_changed = bool(is_after.any())
+            stay.has_changed = bool((is_after & _are_near(middles, stay)).any())
 
 
 def _evidence_of(
@@ -338,14 +337,13 @@ def _chain_stays(group: LabelGroup, stays: Sequence[PlacedStay], *, proven: bool
         for stay in stays
     ]
     first, last, firm_last, place, beside, ids = np.array(integers, np.int64).T
-    x, y, z = _middles(stays)
+    middles = _middles(stays)
     was_left = np.array([stay.left is not None for stay in stays])
     has_changed = np.array([stay.has_changed for stay in stays])
     newest = np.zeros(len(stays), np.int64)  # by thing, the number of its newest stay
     for number, stay in enumerate(stays):
         lasts = newest[: len(instances)]
-        is_near = np.hypot(x[lasts] - x[number], y[lasts] - y[number]) <= GATE_MM
-        is_near &= np.abs(z[lasts] - z[number]) <= STOREY_MM
+        is_near = _are_near(middles[:, lasts], stay)
         # It was seen to end, or is so near that both would be seen together, or has the same id.
         has_ended = was_left[lasts] | is_near & (last[lasts] <= first[number]) | (stay.id > 0)
         if not proven:
@@ -370,17 +368,24 @@ def _middles(stays: Sequence[PlacedStay]) -> Floats:
     return np.array([(stay.x, stay.y, stay.z) for stay in stays]).T
 
 
+def _are_near(middles: Floats, stay: PlacedStay) -> Flags:
+    """Returns which of some middles are near that of a stay, on its storey."""
+    x, y, z = middles
+    are_near: Flags = np.hypot(x - stay.x, y - stay.y) <= GATE_MM
+    are_near &= np.abs(z - stay.z) <= STOREY_MM
+    return are_near
+
+
 def _seen_near(stays: Sequence[PlacedStay]) -> Iterator[Ns]:
     """Yields for each stay when (ns) the newest stay near it began; it may be the stay itself."""
-    x, y, z = _middles(stays)
-    begun = np.array([stay.firm_first for stay in stays], np.int64)
+    middles = _middles(stays)
+    x, begun = middles[0], np.array([stay.firm_first for stay in stays], np.int64)
     by_x = stable_order(x)
     begins, ends = (np.searchsorted(x[by_x], x + reach) for reach in (-GATE_MM, GATE_MM))
-    for nth, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+    for stay, begin, end in zip(stays, begins.tolist(), ends.tolist(), strict=True):
         beside = by_x[begin:end]
-        is_near = np.hypot(x[beside] - x[nth], y[beside] - y[nth]) <= GATE_MM
-        is_near &= np.abs(z[beside] - z[nth]) <= STOREY_MM
-        yield int(begun[beside[is_near]].max(initial=begun[nth]))
+        is_near = _are_near(middles[:, beside], stay)
+        yield int(begun[beside[is_near]].max(initial=stay.firm_first))
 
 
 def _split_around_others(stays: Sequence[PlacedStay], observed: Observations) -> list[PlacedStay]:

@@ -102,6 +102,19 @@ def test_what_a_thing_was_called_wrongly_is_known_after_it_came_back_to_a_place(
     assert sum((stay.misread_as for stay in mug.stays), Counter()) == {"bowl": 27}
 
 
+@pytest.mark.parametrize(("height", "things"), [(0.7, 2), (4.7, 1)])
+def test_what_is_in_another_state_is_the_same_thing_on_its_own_storey_alone(
+    height: float, things: int
+) -> None:
+    def crate(label: str, y: float, z: float) -> Detections:
+        return [(f"crate_{label}", (2.0, y, z))]
+
+    full, empty, later = crate("full", 0, 0.7), crate("empty", 0, height), crate("full", 3, 0.7)
+    found = estimated(*[(HERE, full)] * 300, *[(HERE, empty + later)] * 300)
+    crates = [thing for thing in found.instances if thing.label == "crate full"]
+    assert len(crates) == things
+
+
 LEFT, RIGHT = (0.0, 0.0, 0.9), (0.0, 0.0, -0.9)
 
 
