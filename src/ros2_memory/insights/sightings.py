@@ -458,8 +458,9 @@ def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
         is_plain = what == "text" or all(name.startswith(NUMBERS) for name in types)
         if is_plain and not is_latched(view, topic):
             yield (
-                f"a {what} on {topic} counts for the moment in which it was said: changes, and by "
-                "value, of get_topic_in_range have for how long each held until the next one"
+                f"a {what} on {topic} counts for the moment in which it was said, and matches in a "
+                "row less than 10 s apart once: get_topic_in_range lists each; its changes, and by "
+                "value, have for how long each held until the next one"
             )
 
 

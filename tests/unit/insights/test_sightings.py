@@ -1020,3 +1020,15 @@ def test_a_topic_with_a_dot_in_its_name_is_read_beside_another(tmp_path: Path, n
     asked_for = {"topic": "/bumper", "condition_type": "equals", "value": True, "with": name}
     (row,) = asked(memory_of(tmp_path), "find_matches", **asked_for)["sightings"]
     assert "drive" in str(row["with"])
+
+
+def test_calls_within_ten_seconds_are_noted_as_one(tmp_path: Path) -> None:
+    """A planner calls a tool again where it failed: two calls are no single one."""
+    calls = [(0, "drive"), (40, "grasp"), (48, "grasp"), (70, "grasp"), (90, "say")]
+    said = [text(BEGIN + at * S, f'{{"tool": "{name}"}}', "/trace") for at, name in calls]
+    beats = [boolean(BEGIN + at * S // 10, data=False, topic="/beat") for at in range(1000)]
+    memory = remembered(tmp_path, in_order([*said, *beats]), recalls=False)
+    sought = {"condition_type": "equals", "field": "data.tool", "value": "grasp"}
+    rows = asked(memory, "find_matches", topic="/trace", by="day", **sought)
+    assert table(rows)["all"]["count"] == 2
+    assert "matches in a row less than 10 s apart once" in str(rows["notes"])
