@@ -11,7 +11,7 @@ from bisect import bisect_right
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain, islice, starmap
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
@@ -27,7 +27,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region, Storey, contains
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, spans_of, united, without
 from ros2_memory.core.text import MAX_NAMED, abbreviate, caseless, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_HOUR, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_DAY, NS_PER_HOUR, Ns, Span
 from ros2_memory.history.condition_hints import compared_frames
 from ros2_memory.history.conditions import Sought, condition_of, types_matching
 from ros2_memory.history.coverage import recording_gaps, span_text, unknown_times
@@ -357,10 +357,12 @@ class Scope:
     def settled(self) -> Scope:
         """Returns a scope that tests its conditions now, and not for each question again."""
         settled = copy(self)
-        if not self._states:
-            return settled
-        parts = self.parts_of(self.window.start, self.window.stop - 1)
-        settled._inside, settled._states = [(first, last + 1) for first, last in parts], []
+        if self._states:
+            # A wrong clock makes a window long: between days with poses nothing is asked.
+            bounds = self._view.bounds(resolve_path_topic(self._view), self.window)
+            days = spans_of(*pieces_of(*bounds, NS_PER_DAY))
+            parts = chain.from_iterable(starmap(self.parts_of, days))
+            settled._inside, settled._states = [(first, last + 1) for first, last in parts], []
         return settled
 
     @property
