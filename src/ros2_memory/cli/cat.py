@@ -88,7 +88,7 @@ def cat(
     note_unread(view, window)
     note_times_twice(view, window)
     print_notes(view.notes.sentences())
-    if not count:
+    if not count and view.notes.complete:
         advice = "`ros2-memory topics` says when there are some"
         print(f"no message of {name} in this time; {advice}", file=sys.stderr)
     return not count or not view.notes.complete

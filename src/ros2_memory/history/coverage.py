@@ -216,13 +216,19 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each way in which messages of a window were lost."""
     losses = read_losses(bag_dir, window.start, window.stop)
     yield from _count_losses(losses, _LOST, window)
-    refused = [loss for loss in losses if loss.by == "refused"]
-    if refused:
-        first, last = min(loss.start for loss in refused), max(loss.stop for loss in refused) - 1
-        topics = sorted({loss.topic for loss in refused})
+    refused = defaultdict[str, Spans](list)
+    for loss in losses:
+        if loss.by == "refused":
+            refused[loss.topic].append((loss.start, loss.stop))
+    topics_of = defaultdict[str, list[str]](list)
+    for topic, spans in sorted(refused.items()):
+        first, *others = (span_text(start, stop - 1) for start, stop in united(spans))
+        more = counted(len(others), "more time")
+        topics_of[f"{first}, and {more}, at last from {others[-1]}" if others else first] += [topic]
+    for when, topics in topics_of.items():
         yield (
-            f"messages of {listed(topics)} are missing from {span_text(first, last)}, as the QoS "
-            "or type of a publisher did not fit the subscription: how many is not known"
+            f"messages of {listed(topics)} are missing from {when}, as the QoS or type of a "
+            "publisher did not fit the subscription: how many is not known"
         )
 
 

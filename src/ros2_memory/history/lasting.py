@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.facts import GOALS
 from ros2_memory.analysis.intervals import PACED, SILENCE_NS, pause_of
 from ros2_memory.bag_dir.state_files import excluded_between
 from ros2_memory.core.memo import Key
@@ -195,6 +196,8 @@ def breaks_of(view: View, topic: str) -> list[Ns]:
     if not is_latched(view, topic):
         breaks.update(start for start, _ in snapshot.breaks)
         breaks.update(silence.start for silence in snapshot.silences if silence.topic == topic)
+        if not {*view.timeline.types_of(topic)} <= {TEXT, GOALS}:
+            breaks.update(start for start, _ in snapshot.gaps)
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is not None and latest is not None:
         spans = [fault.span for fault in snapshot.misdated]

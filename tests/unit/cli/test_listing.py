@@ -355,6 +355,14 @@ def test_a_topic_whose_type_changes_is_printed_to_its_end(folder: Path, exits: P
     assert "has no field 'none'" in exits(2, "cat /odom . --field none --csv").err
 
 
+def test_cat_calls_no_message_absent_that_cannot_be_decoded(tmp_path: Path, exits: Program) -> None:
+    torn = Msg("/torn", "std_msgs/msg/String", T0, b"\0\1\0\0\xff\xff\xff\xff")
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [torn])
+    err = exits(1, "cat /torn", tmp_path).err
+    assert "1 message left out that cannot be decoded" in err
+    assert "no message" not in err
+
+
 def test_a_recorded_number_is_no_time_however_large(tmp_path: Path, exits: Program) -> None:
     free = make("std_msgs/msg/Float64", data=2_147_483_648.5)
     write_mcap(tmp_path / "a" / "a_0.mcap", [Msg("/free", "std_msgs/msg/Float64", T0, free)])

@@ -178,7 +178,15 @@ def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after
     found = matches(memory_of(tmp_path, recalls=recalls), BUMPER, 0, 10_000)["sightings"]
     assert [row["duration_s"] for row in found] == [1999, 1000]
     write_splits(tmp_path, along_x(T0 + 8500 * S, 1501), 2000)
-    matched = partial(matches, memory_of(tmp_path, recalls=recalls), BUMPER)
+    memory = memory_of(tmp_path, recalls=recalls)
+    matched = partial(matches, memory, BUMPER)
+    found = matched(0, 10_000)["sightings"]
+    assert [row["duration_s"] for row in found] == [1999, 1000]
+    said = partial(asked, memory, "get_topic_in_range", topic=BUMPER)
+    span = {"start": T0 // S, "end": T0 // S + 10_000}
+    lengths = [change["seconds"] for change in said(changes=True, **span)["changes"]]
+    assert lengths[1::2] == [1000, 1999]
+    assert table(said(by="value", **span))["true"]["seconds"] == 1000 + 1999
     for first, last, began, held in (
         (0, 10_000, 2, 1000 + 1999),
         (4500, 4800, 0, 300),

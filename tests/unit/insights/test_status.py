@@ -96,11 +96,22 @@ def lost(kind: Any, begin_s: float, stop_s: float, count: int = 0, topic: str = 
         ),
         (
             "wall",
-            [lost("refused", 10, 11.5), lost("refused", 13, 14.5)],
+            [lost("refused", 10, 11.5), lost("refused", 13, 14.5), lost("refused", 50, 51)],
             (
-                f"messages of /odom are missing from {T0 + 10}.000000 to {T0 + 14}.500000 (4.5 s),"
+                f"messages of /odom are missing from {T0 + 10}.000000 to {T0 + 11}.500000 (1.5 s),"
+                f" and 2 more times, at last from {T0 + 50}.000000 to {T0 + 51}.000000 (1 s),"
                 " as the QoS or type of a publisher did not fit the subscription: how many is not "
                 "known"
+            ),
+        ),
+        (
+            "wall",
+            [lost("refused", 10, 11), lost("refused", 50, 51, topic="/tf")],
+            "; ".join(
+                f"messages of {topic} are missing from {T0 + at}.000000 to {T0 + at + 1}.000000 "
+                "(1 s), as the QoS or type of a publisher did not fit the subscription: how many "
+                "is not known"
+                for topic, at in (("/odom", 10), ("/tf", 50))
             ),
         ),
         # A simulation has another clock than the recorder that ended unexpectedly.

@@ -38,7 +38,16 @@ from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import along_x, boolean, detections, odom, write_mcap, write_splits
+from tests.support.bags import (
+    along_x,
+    boolean,
+    detections,
+    in_order,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.housekeepers import made_moment
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.analysis.motion.posed import off_line
@@ -333,6 +342,16 @@ def test_every_message_is_counted_when_it_was_also_where_bags_have_many(
     assert set(row["spoke"]) <= {16, 17}
     [silent] = topics(memory_of(tmp_path), f"start={BEGIN_S + 0.91}&end={BEGIN_S + 0.99}")["topics"]
     assert silent["spoke"] == [0] * 60 or not most_times
+
+
+def test_each_message_counts_once_where_the_type_of_a_topic_changed(tmp_path: Path) -> None:
+    said = [boolean(BEGIN + n * S, True, "/x") for n in range(10)]
+    said += [text(BEGIN + n * S + S // 2, "on", "/x") for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", in_order(said))
+    for around_s in (5, 1800):
+        query = f"start={BEGIN_S - around_s}&end={BEGIN_S + 10 + around_s}"
+        [row] = topics(memory_of(tmp_path), query)["topics"]
+        assert sum(row["spoke"]) == 15
 
 
 def test_topics_are_listed_also_where_there_is_no_time_to_read_them(

@@ -241,19 +241,18 @@ def _count_in_bins(view: View, topic: str, window: TimeWindow) -> Ints:
 
     They count as spread evenly over their bags if these are short, or reading them takes long.
     """
-    extents = [*view.timeline.extents(topic, window)]
-    counts = [sum(part.count for part in extent.bag.summary.of(topic)) for extent in extents]
+    columns = [segment.column(topic) for segment in view.timeline.segments_in(window)]
+    rows = [np.stack(column[1:]) for column in columns if column is not None]
+    firsts, lasts, counts = np.concatenate([np.empty((3, 0), np.int64), *rows], axis=1)
     edges = np.linspace(0, window.stop - window.start, BINS + 1)
-    longest = max((extent.last - extent.first for extent in extents), default=0)
-    if longest > edges[1] and sum(counts) <= _MOST_TIMES:
+    if (lasts - firsts > edges[1]).any() and counts.sum() <= _MOST_TIMES:
         with suppress(QueryTimeoutError):
             scanned = scan(view, topic, window, columns=False)
             times = concatenated(rows.times for rows in scanned)
             return np.histogram(times - window.start, edges)[0]
     before_edges = np.zeros(BINS + 1)
-    for extent, count in zip(extents, counts, strict=True):
-        ends = extent.first - window.start, extent.last + 1 - window.start
-        before_edges += np.interp(edges, ends, (0, count))
+    for first, last, count in zip(firsts, lasts, counts, strict=True):
+        before_edges += np.interp(edges, np.array((first, last + 1)) - window.start, (0, count))
     return np.diff(np.rint(before_edges)).astype(np.int64)
 
 
