@@ -382,7 +382,7 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
 
 
 def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
-    """Returns the gaps of the recording, each prolonged until the topic is heard again."""
+    """Returns the gaps of the recording, a long one prolonged until the topic is heard again."""
     if is_latched(binned.view, topic):
         return binned.gaps
     firsts, lasts = binned.bounds([topic])
@@ -393,7 +393,7 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[Span]:
     following = np.searchsorted(lasts[order], ends)
     earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
     heard_again = np.append(earliest, MAX_NS)[following].clip(ends)
-    return spans_of(begins, heard_again)
+    return spans_of(begins, np.where(ends - begins > SILENCE_NS, heard_again, ends))
 
 
 def _silences(binned: BinnedWindow, topic: str, spans: Sequence[_HeldSpan]) -> Sequence[Span]:

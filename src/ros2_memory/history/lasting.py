@@ -8,8 +8,8 @@ It ends before that, in this order:
    topic that is published regularly, if these are longer;
 2. where messages of the topic were deleted;
 3. in a pause of more than `SILENCE_NS`, at any other of its `breaks_of`: where the clock was wrong;
-   and unless the topic is latched, where another run of the recorder begins, or the topic falls
-   silent for longer than usual.
+   and unless the topic is latched, where another run of the recorder begins, a gap begins (not of
+   texts and goals), or the topic falls silent for longer than usual.
 """
 
 from __future__ import annotations
@@ -189,7 +189,8 @@ def breaks_of(view: View, topic: str) -> list[Ns]:
 
     Messages were deleted then, or the clock was wrong: misdated bags before the memory end, or
     those after it begin. Unless the topic is latched, another run of the recorder began, or it fell
-    silent for longer than usual, too.
+    silent for longer than usual, too; and unless it says texts or goals, nothing was recorded for
+    more than `SILENCE_NS`.
     """
     snapshot = view.snapshot
     breaks = {*deletions(view, topic)}
@@ -197,7 +198,7 @@ def breaks_of(view: View, topic: str) -> list[Ns]:
         breaks.update(start for start, _ in snapshot.breaks)
         breaks.update(silence.start for silence in snapshot.silences if silence.topic == topic)
         if not {*view.timeline.types_of(topic)} <= {TEXT, GOALS}:
-            breaks.update(start for start, _ in snapshot.gaps)
+            breaks.update(start for start, end in snapshot.gaps if end - start > SILENCE_NS)
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is not None and latest is not None:
         spans = [fault.span for fault in snapshot.misdated]
