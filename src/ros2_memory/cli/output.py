@@ -177,17 +177,19 @@ def filled_leaves(value: JsonValue) -> dict[str, JsonValue]:
 
 
 def with_plain_numbers(value: JsonValue, is_recorded: bool = True) -> JsonValue:
-    """Returns a value whose recorded floats are texts, since one may seem a time.
+    """Returns a value whose recorded floats are texts, since one may seem a time; a stamp is one.
 
     All of a value that `is_recorded`; of a reply those below the keys `_RECORDED`.
     """
     if isinstance(value, float):
-        return f"{value:.15g}" if is_recorded else value
+        return repr(value).removesuffix(".0") if is_recorded else value
     if isinstance(value, list):
         return [with_plain_numbers(inner, is_recorded) for inner in value]
     if isinstance(value, dict):
         return {
-            key: with_plain_numbers(inner, is_recorded or key in _RECORDED)
+            key: inner
+            if key.endswith("stamp")
+            else with_plain_numbers(inner, is_recorded or key in _RECORDED)
             for key, inner in value.items()
         }
     return value

@@ -31,7 +31,7 @@ from ros2_memory.columns import database
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import McapLayout, Msg, make, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, header, make, odom, text, write_mcap
 from tests.support.forked_commands import write_command
 from tests.support.housekeepers import later, own_all, recording_now
 from tests.support.program import Program
@@ -377,6 +377,9 @@ def test_a_recorded_number_is_no_time_however_large(tmp_path: Path, exits: Progr
         assert "2147483648.5" in printed
         assert "2038" not in printed
         assert format_time(T0 / NS_PER_S) in printed
+    stamped = Msg("/head", "std_msgs/msg/Header", T0, header(T0 + 1000, "arm"))
+    write_mcap(tmp_path / "b" / "b_0.mcap", [stamped])
+    assert f"stamp: {format_time(T0 / NS_PER_S + 1e-6)}" in exits(0, "cat /head", tmp_path).out
 
 
 def test_csv_has_a_column_for_each_field(folder: Path, exits: Program) -> None:
