@@ -86,23 +86,23 @@ women
 frau frauen gesicht gesichter junge kind kinder leute mädchen maedchen mann männer maenner
 mensch
 menschen personen
-enfant enfants femme femmes fille garçon garcon gens homme hommes humain personne personnes
+enfant enfants femme femmes fille garçon gens homme hommes humain personne personnes
 visage
 bambina bambino donna donne faccia persone ragazza ragazzo umano uomini uomo viso volto
-cara chica chico gente hombre hombres humano mujer mujeres niña niño niños nina nino ninos
+cara chica chico gente hombre hombres humano mujer mujeres niña niño niños
 persona
 personas rostro
-criança crianca homem homens menina menino mulher mulheres pessoa pessoas rosto
+criança homem homens menina menino mulher mulheres pessoa pessoas rosto
 gezicht jongen kinderen mannen meisje mens mensen vrouw vrouwen
-ansigt ansikte ansikt barn flicka jente kvinde kvinna kvinne människa manniska menneske pige
+ansigt ansikte ansikt barn flicka jente kvinde kvinna kvinne människa menneske pige
 pojke
-człowiek czlowiek dziecko kobieta ludzie mężczyzna mezczyzna osoba osoby twarz
-adam çocuk cocuk insan kadın kadin kişi kisi yüz
-девочка женщина лицо люди мальчик мужчина ребёнок ребенок человек
+człowiek czlowiek dziecko kobieta ludzie mężczyzna osoba osoby twarz
+adam çocuk insan kadın kadin kişi yüz
+девочка женщина лицо люди мальчик мужчина ребёнок человек
 人 人物 人脸 人类 行人 男人 女人 男 女 孩子 小孩 儿童 男性 女性 子供 子ども 顔 歩行者
 사람 남자 여자 아이 어린이 얼굴 보행자
 """  # noqa: RUF001 (Turkish)
-_PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
+_PEOPLE: Final = frozenset(caseless(_WORDS_FOR_PEOPLE).split())
 _WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
 """Words also begin at capitals: `TrackedPersons`."""
 _WORD_OR_NUMBER: Final = re.compile(r"[^\W\d_]+|\d+")
