@@ -36,7 +36,7 @@ _EARLIEST_TIME: Final = 1e9
 _LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
 _RECORDED: Final = ("value", "min", "max")
-"""Keys of what messages contain, which may be any number."""
+"""Keys of replies with fields of messages: a number there need not be a time."""
 
 
 def print_line(line: str) -> None:

@@ -530,10 +530,10 @@ class _ConditionStates:
             time = stop
 
     def _span_from(self, time: Ns, until: Ns) -> Span:
-        """Returns the first span, of those read, in which the condition holds at a time or later.
+        """Returns the first known span in which the condition holds at a log time (ns) or later.
 
-        If there is none, it is empty, at the end of what was read. It is read up to `until`, but an
-        hour at most.
+        Messages are read up to `until`, for an hour at most. Without such a span among them it is
+        empty, at the end of the window that was read.
         """
         if not self._read.contains(time):
             self._read_around(time, until)
@@ -549,7 +549,7 @@ class _ConditionStates:
         tested = self._tested(TimeWindow(start - self._look_back, stop))
         if not tested.times.size or tested.times[0] > start:
             before = self._newest_before(start)
-            # Between the two nothing is said: earlier times need no further search.
+            # There is no message between the two: earlier times need no further search.
             start = MIN_NS if before is None else int(before.times[0]) + 1
             tested = tested if before is None else stacked([before, tested])
         self._read = TimeWindow(start, stop)

@@ -52,8 +52,7 @@ class Observations:
         fields: the field of view of each topic; see `_fields_of_view`.
         side: for each spot, the mean of the unit vectors to it from where it was seen; 0 if that
             is unknown.
-        ids: the id by which each spot is told from others of its label, as `_add_places` found it;
-            0 for none.
+        ids: the id that distinguishes each spot from others of its label; 0 for none.
         go_on: as in `estimate`.
     """
 
