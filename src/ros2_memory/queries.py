@@ -974,7 +974,7 @@ def _last_match(
         try:
             match, notes_on_days = _last_match_in(days, sought, until)
         except NoDataError as error:
-            missed = missed or error
+            missed = missed or error.detached()
         except QueryTimeoutError as error:
             if missed is None or error.searched_back_to is not None:
                 raise

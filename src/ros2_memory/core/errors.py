@@ -22,7 +22,7 @@ Adapters translate every foreign exception into this tree; only `tools.replies` 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -32,6 +32,15 @@ class EpisodicError(Exception):
     """Base of the tree. `str(error)` is a full sentence for the person or planner who asked."""
 
     code: ClassVar[str] = "internal"
+
+    def detached(self) -> Self:
+        """Returns the error itself, without what its traceback and causes refer to.
+
+        One that a function catches and keeps refers to its frame, and the frame to the error: what
+        the call read would stay in memory until the garbage collector finds the circle.
+        """
+        self.__context__ = self.__cause__ = None
+        return self.with_traceback(None)
 
 
 class ConfigError(EpisodicError):

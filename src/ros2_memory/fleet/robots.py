@@ -332,7 +332,7 @@ def _start(
         try:
             answer.set_result(ask())
         except EpisodicError as error:
-            answer.set_result(error)
+            answer.set_result(error.detached())
         except Exception:
             log.exception("robot_failed", robot=robot.name)
             fault = "failed through a fault in this server; its log has the cause"

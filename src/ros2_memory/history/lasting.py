@@ -17,6 +17,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import proxy
 
 import numpy as np
 
@@ -87,7 +88,9 @@ class Lasting:
     def __init__(
         self, view: View, topics: Collection[str], *, states: bool = True, texts: bool = False
     ) -> None:
-        self._view, self._topics = view, topics
+        # The view refers to it: without a circle, what was read is freed as the call ends.
+        self._view: View = proxy(view)
+        self._topics = topics
         ending = [topic for topic in topics if not (texts and is_text(view, topic))]
         self._heard = [heard for topic in ending for heard in _heard_in(view, topic)]
         self._near = _NOWHERE  # the session of the last lookup

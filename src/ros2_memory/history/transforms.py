@@ -130,8 +130,7 @@ def transform_at(
                 answer = _transform_of_session(view, session, frames, at, explains=explains)
                 answers.append((session, answer))
             except NoDataError as error:
-                # The traceback refers to this frame, and so to the failures: a circle.
-                failures.append(error.with_traceback(None))
+                failures.append(error.detached())
         if answers:
             break
     if not answers:

@@ -55,8 +55,7 @@ def at_each(
         except NoDataError as error:
             at = ns_argument("timestamps", moment.at_s or 0.0)
             answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
-            # A traceback refers to this frame, and the frame to the failures: break the cycle.
-            failures.append(error.with_traceback(None))
+            failures.append(error.detached())
     if len(failures) == len(answers) and len({failure.detail for failure in failures}) == 1:
         raise failures.pop(0)
     return AtEach(tuple(answers))

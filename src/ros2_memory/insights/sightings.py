@@ -671,8 +671,7 @@ def _with_fields(
             try:
                 narrowed = _narrowed(view, sighting, newest, fields)
             except InvalidArgumentsError as error:
-                # A traceback refers to this frame, and the frame to the errors: break the cycle.
-                refused.append(error.with_traceback(None))
+                refused.append(error.detached())
         sightings.append(narrowed)
     if refused and len(refused) == len(sightings):
         raise refused.pop(0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
 import uuid
 from collections import deque
 from contextlib import contextmanager
@@ -331,23 +332,23 @@ class Dispatcher:
                     done = "ok", answer()
                 except GoneError:  # the store has changed since, and is looked at anew
                     done = "ok", answer()
-            except QueryTimeoutError as error:
-                timeout = QueryTimeoutError(
-                    f"{error}{_note_on_wait(waited_s)}", error.searched_back_to
-                )
-                done = self._failed(BusyError(STOPPING) if self._stopping.is_set() else timeout)
             except Exception as error:  # noqa: BLE001 - it is logged there
                 # Caught here too, because nobody may be waiting for this thread any more.
-                done = self._failed(error)
+                done = self._failed(error, waited_s)
+                _free_frames(error)
         if time.monotonic() - begun > _LONG_S:
             return_free_memory()
         return done
 
-    def _failed(self, error: Exception) -> tuple[str, Reply]:
-        """Returns the outcome and the reply of a call that an error ended.
+    def _failed(self, error: Exception, waited_s: float = 0.0) -> tuple[str, Reply]:
+        """Returns the outcome and the reply of a call that an error ended, after it waited (s).
 
         An error that is not of the domain is a fault of this program, and is logged.
         """
+        if isinstance(error, QueryTimeoutError):
+            detail = f"{error}{_note_on_wait(waited_s)}"
+            timeout = QueryTimeoutError(detail, error.searched_back_to)
+            error = BusyError(STOPPING) if self._stopping.is_set() else timeout
         try:
             if not isinstance(error, EpisodicError):
                 raise error  # noqa: TRY301 - logged as a fault while an error is rendered is
@@ -357,6 +358,13 @@ class Dispatcher:
             log.exception("tool_failed")
             context = structlog.contextvars.get_contextvars()
             return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+def _free_frames(error: BaseException | None) -> None:
+    """Frees what the functions read that an error ended: a frame may refer to its own error."""
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__context__
 
 
 def _note_on_wait(waited_s: float) -> str:

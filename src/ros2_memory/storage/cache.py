@@ -34,6 +34,7 @@ class ByteLru(Generic[T]):
 
     def __init__(self, capacity: int) -> None:
         self._store: _SharedStore[T] = _SharedStore(capacity)
+        self._space = object()  # not the cache: the store would keep itself alive
 
     def namespace(self) -> ByteLru[T]:
         """Returns a cache with keys of its own, within the capacity of this one."""
@@ -44,10 +45,10 @@ class ByteLru(Generic[T]):
     def get(self, key: Hashable) -> T | None:
         """Returns the value of the key, or None."""
         with self._store.lock:
-            entry = self._store.entries.get((self, key))
+            entry = self._store.entries.get((self._space, key))
             if entry is None:
                 return None
-            self._store.entries.move_to_end((self, key))
+            self._store.entries.move_to_end((self._space, key))
             return entry.value
 
     def put(self, key: Hashable, value: T, size: int) -> None:
@@ -55,7 +56,7 @@ class ByteLru(Generic[T]):
         store, entries = self._store, self._store.entries
         new = _Entry(value, size + _ENTRY_BYTES)
         with store.lock:
-            replaced = entries.pop((self, key), None)
+            replaced = entries.pop((self._space, key), None)
             if replaced is not None:
                 store.bytes -= replaced.bytes
             if new.bytes > store.capacity:
@@ -65,7 +66,7 @@ class ByteLru(Generic[T]):
                     entries.move_to_end(spared)
                 _, dropped = entries.popitem(last=False)
                 store.bytes -= dropped.bytes
-            entries[self, key] = new
+            entries[self._space, key] = new
             store.bytes += new.bytes
 
 
@@ -78,12 +79,10 @@ class _Entry(NamedTuple, Generic[T]):
 
 @dataclass(slots=True)
 class _SharedStore(Generic[T]):
-    """The entries of caches that share a capacity, by cache and key; the last used comes last."""
+    """The entries of caches that share a capacity, by space and key; the last used comes last."""
 
     capacity: int
-    entries: OrderedDict[tuple[ByteLru[T], Hashable], _Entry[T]] = field(
-        default_factory=OrderedDict
-    )
+    entries: OrderedDict[tuple[object, Hashable], _Entry[T]] = field(default_factory=OrderedDict)
     bytes: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
