@@ -29,7 +29,7 @@ from ros2_memory.core.text import (
     NAMED_IN_TYPES,
     looks_like_json,
 )
-from ros2_memory.messages.conversions import NamedNumber, number, triple, xyz
+from ros2_memory.messages.conversions import NamedNumber, number, triple
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -255,11 +255,12 @@ def hypotheses_field(fields: Collection[str]) -> str | None:
 
 def lists_of_seen(fields: Mapping[str, object]) -> frozenset[str]:
     """Returns the fields in which an object may list labels of things that were seen."""
-    is_beside = LOOKED_FOR in fields and any(
+    seen = LISTS_OF_LABELS.intersection(fields)
+    is_beside = LOOKED_FOR in seen and any(
         isinstance(part, list | dict) and name != LOOKED_FOR and name not in _NO_CONTENT
         for name, part in fields.items()
     )
-    return LISTS_OF_LABELS if is_beside else LISTS_OF_LABELS - {LOOKED_FOR}
+    return seen if is_beside else seen - {LOOKED_FOR}
 
 
 def has_more_content(fields: Collection[str]) -> bool:
@@ -276,7 +277,8 @@ def _has_name_alone(value: JsonObject) -> bool:
 
 def _label(value: JsonObject) -> str | None:
     """Returns the name of an object that is there: a text before a whole number; else None."""
-    if any(value.get(flag) is absent for flag, absent in SAYS_ABSENT.items()):
+    said = value.keys() & SAYS_ABSENT.keys()
+    if said and any(value[flag] is SAYS_ABSENT[flag] for flag in said):
         return None
     first_number = None
     for name in naming_fields(value):
@@ -295,9 +297,11 @@ def _number_as_text(value: JsonValue) -> str | None:
 
 
 def _id(value: JsonObject) -> str:
-    ids = (value.get(name) for name in reversed(IDS))
-    words = (word if isinstance(word, str) else _number_as_text(word) for word in ids)
-    return next(filter(None, words), "")
+    for name in reversed(IDS):
+        word = value.get(name)
+        if word is not None and (text := word if isinstance(word, str) else _number_as_text(word)):
+            return text
+    return ""
 
 
 def _best_result(results: JsonValue) -> JsonObject | None:
@@ -350,7 +354,7 @@ def _detection_at(
             node = node.get(name) if isinstance(node, dict) else None
             if isinstance(node, dict):
                 point_frame = _frame(node) or point_frame
-        point = xyz(node) if isinstance(node, dict) else triple(node)
+        point = triple(tuple(map(node.get, "xyz")) if isinstance(node, dict) else node)
         if point is not None and any(point) and all(map(math.isfinite, point)):
             return Detection(label, point, point_frame, score, own_id)
     return Detection(label, None, frame, score, own_id)
