@@ -357,6 +357,36 @@ def test_transforms_that_do_not_place_the_body_are_named(tmp_path: Path) -> None
     assert left_out in reply["notes"]
 
 
+def test_transforms_on_topics_that_are_not_configured_are_named_where_a_frame_is_unknown(
+    tmp_path: Path,
+) -> None:
+    """Two robots in one recording: the transforms of the second are in its namespace."""
+    messages = [
+        tf(
+            T0 + n * S,
+            transform(T0 + n * S, "map", f"{frames}odom", (1.0, 0.0, 0.0)),
+            transform(T0 + n * S, f"{frames}odom", f"{frames}base_link", (0.1 * n, 0.0, 0.0)),
+            topic=topic,
+        )
+        for n in range(9)
+        for topic, frames in (("/tf", "r1/"), ("/r2/tf", ""))
+    ]
+    messages += [odom(T0 + n * S, 0.1 * n, 0.0, topic="/r2/odom") for n in range(9)]
+    messages.sort(key=lambda message: message.log_time)
+    limits = QuerySettings(pose_topic="/r2/odom")
+    memory = remembered(tmp_path, messages, limits=limits)
+    hint = "transforms are recorded on /r2/tf, too: add them to data.tf_topics"
+    refused = asked(memory, "get_position_at", timestamp=T0_S + 2, frame_id="map")
+    assert hint in refused["detail"]
+    assert "base_link" not in refused["detail"]  # of the other robot
+    unknown = asked(memory, "get_transform_at", parent="map", child="base_link", timestamp=T0_S + 2)
+    assert unknown["reason"] == "frame_unknown"
+    assert hint in unknown["detail"]
+    both = remembered(tmp_path, messages, limits=replace(limits, tf_topics=("/tf", "/r2/tf")))
+    there = asked(both, "get_position_at", timestamp=T0_S + 2, frame_id="map")
+    assert there["x"] == pytest.approx(1.2)
+
+
 def test_what_was_read_as_time_ran_out_is_in_the_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

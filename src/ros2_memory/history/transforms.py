@@ -30,7 +30,7 @@ from ros2_memory.core.arrays import rows_of
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
-from ros2_memory.core.text import Reason
+from ros2_memory.core.text import Reason, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -243,7 +243,7 @@ def _explain_failure(
         is_unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
         connected = _nearest_connection(view, frames, at, session) if is_unknown else None
         if connected is None:
-            return near_failure
+            return NoDataError(near_failure.reason, near_failure.detail + other_transforms(view))
         away = f"{seconds(abs(connected - at))} {'earlier' if connected < at else 'later'}"
         advice = f"the two were connected {away}: ask about {unix_text(connected)}"
         return NoDataError(reason_between(view, near), f"{near_failure.detail}; {advice}")
@@ -251,6 +251,21 @@ def _explain_failure(
     is_between = before and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
     reason = reason_between(view, near) if is_between else reason_beyond(view, at)
     return NoDataError(reason, failure.detail)
+
+
+def other_transforms(view: View) -> str:
+    """Returns a clause that names recorded topics of transforms that are not read; "" without."""
+    limits = view.limits
+    others = [
+        topic
+        for topic, types in view.timeline.types.items()
+        if topic not in {*limits.tf_topics, *limits.tf_static_topics}
+        and any(name.endswith("/TFMessage") for name in types)
+    ]
+    if not others:
+        return ""
+    moving = "data.tf_topics, what is latched to data.tf_static_topics"
+    return f"; transforms are recorded on {listed(others)}, too: add them to {moving}"
 
 
 def _nearest_connection(view: View, frames: tuple[str, str], at: Ns, session: Session) -> Ns | None:

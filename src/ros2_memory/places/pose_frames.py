@@ -52,6 +52,7 @@ from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connects,
     connects_in_time,
+    other_transforms,
     transform_at,
 )
 from ros2_memory.places.robot_tracks import TrackReader
@@ -234,7 +235,8 @@ def _require_connected(view: View, frame_id: str, own_frame: str) -> None:
     if not (own_frame and connects(view, (frame_id, own_frame))):
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-            f"{own_frame or 'a pose without a frame'}{_body_there(view, frame_id, own_frame)}"
+            f"{own_frame or 'a pose without a frame'}"
+            f"{other_transforms(view) or _body_there(view, frame_id, own_frame)}"
         )
 
 
