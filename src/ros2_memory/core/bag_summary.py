@@ -95,6 +95,14 @@ class SummarySchema:
     pauses: Pauses = ()
     absences: Absences = ()
 
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # Once: bags are looked up by their content, and some recordings have thousands of topics.
+        return hash(tuple(getattr(self, column.name) for column in fields(self)))
+
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """The notes, and a sentence on a clock that was set back."""
@@ -120,8 +128,8 @@ class SummarySchema:
 
     @cached_property
     def positions(self) -> dict[str, tuple[int, ...]]:
-        """The positions of each topic among `topics`: one for each of its types."""
-        return _positions_of(self.topics)
+        """The positions of each topic among `topics`; see `positions_of`."""
+        return positions_of(self.topics)
 
     def to_json(self) -> str:
         """Returns the schema as JSON; equal schemas give equal texts."""
@@ -208,7 +216,8 @@ def _shared_headers(topics: tuple[TopicHeader, ...]) -> tuple[TopicHeader, ...]:
 
 
 @lru_cache(maxsize=_CACHED_SCHEMAS)
-def _positions_of(topics: tuple[TopicHeader, ...]) -> dict[str, tuple[int, ...]]:
+def positions_of(topics: tuple[TopicHeader, ...]) -> dict[str, tuple[int, ...]]:
+    """Returns the positions of each topic: one for each of its types."""
     positions: dict[str, tuple[int, ...]] = {}
     for position, header in enumerate(topics):
         positions[header.topic] = (*positions.get(header.topic, ()), position)

@@ -17,7 +17,7 @@ import numpy as np
 from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.arrays import run_starts
-from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
+from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of, positions_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import Spans, enclosing, spans_of, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span
@@ -269,6 +269,11 @@ class Segment:
         """All topics; one with two types, or one that is latched at times, appears twice."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
 
+    @cached_property
+    def positions(self) -> dict[str, tuple[int, ...]]:
+        """The positions of each topic among `headers`; see `positions_of`."""
+        return positions_of(self.headers)
+
     def _bags_with(self, attribute: str) -> Iterator[BagFile]:
         """Yields the bags whose schema has a non-empty attribute: mostly none."""
         return self.bags.at(self.bags.with_schema(attrgetter(attribute)))
@@ -294,10 +299,10 @@ class Segment:
 
     def recordings(self, topic: str) -> dict[Path, TopicTotals]:
         """Returns the totals of a topic for each recording that holds it, over all types."""
-        headers = [nth for nth, header in enumerate(self.headers) if header.topic == topic]
-        if not headers:
+        headers = self.positions.get(topic)
+        if headers is None:
             return {}
-        by_folder = zip(self._recording_paths, _joined(self._by_folder[headers]), strict=True)
+        by_folder = zip(self._recording_paths, _joined(self._by_folder[[*headers]]), strict=True)
         return {path: totals for path, totals in by_folder if totals.messages}
 
     @cached_property
@@ -332,7 +337,7 @@ class Segment:
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None if they do not have it."""
-        headers = [header for header in self.headers if header.topic == topic]
+        headers = [self.headers[nth] for nth in self.positions.get(topic, ())]
         if not headers:
             return None
         numbers = self._numbers(headers)[:, np.argsort(self._order)]
@@ -353,7 +358,7 @@ class Segment:
         for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
             if id(schema.topics) not in found:
-                found[id(schema.topics)] = _find_headers(headers, schema.topics)
+                found[id(schema.topics)] = _find_headers(headers, schema)
             rows, positions = found[id(schema.topics)]
             if len(rows) < len(headers):
                 numbers[:, begin:end] = _NO_MESSAGES
@@ -469,12 +474,16 @@ def wider(span: Span | None, other: Span) -> Span:
 
 
 def _find_headers(
-    headers: Sequence[TopicHeader], topics: Sequence[TopicHeader]
+    headers: Sequence[TopicHeader], schema: SummarySchema
 ) -> tuple[list[int], list[int]]:
-    """Returns the rows of the headers that are among some topics, and their positions there."""
-    position_of = {header: position for position, header in enumerate(topics)}
-    rows = [row for row, header in enumerate(headers) if header in position_of]
-    return rows, [position_of[headers[row]] for row in rows]
+    """Returns the rows of the headers that a schema has, and their positions among its topics."""
+    rows, positions = list[int](), list[int]()
+    for row, header in enumerate(headers):
+        for position in schema.positions.get(header.topic, ()):
+            if schema.topics[position] == header:
+                rows.append(row)
+                positions.append(position)
+    return rows, positions
 
 
 def _cut_at(

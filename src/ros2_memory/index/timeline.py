@@ -374,12 +374,19 @@ class Timeline:
     def bag_with(self, topic: str, type_name: str, *, last: bool = False) -> BagFile:
         """Returns the first or last bag that holds the topic under a type; there must be one."""
 
-        def are_held(headers: Iterable[TopicHeader]) -> bool:
-            return any((header.topic, header.type) == (topic, type_name) for header in headers)
+        def has_type(headers: Sequence[TopicHeader], positions: Iterable[int]) -> bool:
+            return any(headers[position].type == type_name for position in positions)
 
         segments = self.segments[::-1] if last else self.segments
-        segment = next(segment for segment in segments if are_held(segment.headers))
-        rows = np.flatnonzero(segment.bags.with_schema(lambda schema: are_held(schema.topics)))
+        segment = next(
+            segment
+            for segment in segments
+            if has_type(segment.headers, segment.positions.get(topic, ()))
+        )
+        has_topic = segment.bags.with_schema(
+            lambda schema: has_type(schema.topics, schema.positions.get(topic, ()))
+        )
+        rows = np.flatnonzero(has_topic)
         return segment.bags[int(rows[-1 if last else 0])]
 
 

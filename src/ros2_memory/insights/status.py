@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import takewhile
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
@@ -12,6 +12,7 @@ from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.errors import BagError, NotInLakeError, RefusedError, UndecodableError
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import counted, listed
@@ -47,6 +48,9 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import Channel
 
+_ByTopicAndType: TypeAlias = "dict[tuple[str, str], list[Channel]]"
+_CHANNELS: Final[Key[dict[tuple[str, bool], _ByTopicAndType]]] = Key()
+"""Of a view: the channels of a bag, by its path and whether the store has them."""
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
 _UNHEARD_NS: Final[Ns] = 30 * NS_PER_S
 """The shortest time without messages that is a problem: as long as the shortest silence."""
@@ -414,11 +418,10 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     """Returns why the first bag with a topic of a type cannot be decoded; None if it can."""
     bag = view.timeline.bag_with(topic, type_name)
     why = view.memory.reader.undecodable
-    stored = view.memory.scanner.channels(view.timeline, bag)
-    channels = _channels_with(topic, type_name, stored)
+    channels = _channels_of(view, bag, are_stored=True).get((topic, type_name), [])
     # Other bags are stored, too, also deleted ones: if they differ in this, the bag itself is read.
     if len({*map(why, channels)}) != 1:
-        channels = _channels_with(topic, type_name, view.bags.channels(bag))
+        channels = _channels_of(view, bag, are_stored=False).get((topic, type_name), [])
     reason = next(filter(None, map(why, reversed(channels))), None)
     if reason is None and any(not channel.schema.text.strip() for channel in channels):
         return _why_first_undecodable(view, topic, type_name)
@@ -439,8 +442,16 @@ def _why_first_undecodable(view: View, topic: str, type_name: str) -> str | None
     return next((failure.reason for failure in failures), None)
 
 
-def _channels_with(topic: str, type_name: str, channels: Sequence[Channel]) -> list[Channel]:
-    return [one for one in channels if (one.topic, one.type) == (topic, type_name)]
+def _channels_of(view: View, bag: BagFile, *, are_stored: bool) -> _ByTopicAndType:
+    """Returns the channels of a bag by topic and type, from the store or from the bag itself."""
+    known, key = view.memo.of(_CHANNELS, dict), (bag.file, are_stored)
+    if key not in known:
+        scanner = view.memory.scanner
+        channels = scanner.channels(view.timeline, bag) if are_stored else view.bags.channels(bag)
+        known[key] = {}
+        for channel in channels:
+            known[key].setdefault((channel.topic, channel.type), []).append(channel)
+    return known[key]
 
 
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
