@@ -49,6 +49,7 @@ from ros2_memory.messages.conversions import (
     parse_path,
     quadruple,
     rotation,
+    segments_of,
     triple,
     unit,
     view,
@@ -351,7 +352,7 @@ class SchemaExtractor:
 
     def text_above(self, message: object, type_name: str, path: str) -> TextAbove:
         """Returns the text, such as one of JSON, into which a path leads; "" without one."""
-        segments = path.split(".")
+        segments = segments_of(path)
         for nth in range(1, len(segments)):
             text = self._member(message, type_name, ".".join(segments[:nth]))
             if isinstance(text, str):
@@ -502,7 +503,7 @@ class SchemaExtractor:
         or else it is the full path in the message, or that of a named element of an array.
         """
         plan = self.plan(type_name)
-        segments = tuple(path.split("."))
+        segments = tuple(segments_of(path))
         mapped, node = plan.fields.get(segments[0]), ABSENT
         if mapped is not None:
             node = descend(_convert(segments[0], self._at(message, mapped)), segments[1:], view)
@@ -587,7 +588,7 @@ def _poses(
 def _is_null(position: Vector3, turn_node: object) -> bool:
     """Returns whether a pose without a rotation is null: all its numbers are zero."""
     turn = xyzw(turn_node) or quadruple(turn_node)
-    return turn is not None and not any(turn) and max(map(abs, position)) <= AT_ORIGIN_M
+    return turn is not None and not any(turn) and all(abs(axis) <= AT_ORIGIN_M for axis in position)
 
 
 def _px4_rotation(node: object) -> Quaternion | None:

@@ -20,9 +20,12 @@ from ros2_memory.core.text import abbreviate, caseless, looks_like_json
 from ros2_memory.messages.conversions import (
     INDEX,
     NamedNumber,
+    Selector,
     Summary,
+    dotted_brackets,
     names_beside,
     names_others,
+    segments_of,
 )
 from ros2_memory.messages.detections import detections_of, parsed_json, without_low_scores
 
@@ -389,7 +392,7 @@ def parse_condition(
     Raises:
         InvalidArgumentsError: an argument is invalid; the message says why and gives an example.
     """
-    path = (field or "").strip() or None
+    path = dotted_brackets((field or "").strip()) or None
     test = _parse_test(condition_type, value, tolerance_m)
     if isinstance(test, Beyond) and path is None:
         raise InvalidArgumentsError(
@@ -403,27 +406,38 @@ def at_field(value: T, dot_path: str) -> list[T]:
     """Returns the parts of an extracted value that a dot-path leads to, perhaps none.
 
     In a list the path goes on in every element: `detections.label` gives all labels. A whole number
-    picks one element (negative: from the end): `detections.0.label` gives the first label. A number
-    picks an axis of a point, too. `positions.elbow` of joint states gives the position beside
+    picks one element (negative: from the end): `detections.0.label` gives the first label, and
+    `status.[name=left].level` the levels of elements with that name. A number picks an axis of a
+    point, too. `positions.elbow` of joint states gives the position beside
     `elbow` in the list of names. In a text that is JSON the path goes on, too.
     """
     head, _, name = dot_path.partition(".")
     names = names_beside(value, dot_path)
-    path = [head, str(names.index(name))] if name in names else dot_path.split(".")
+    path = [head, str(names.index(name))] if name in names else segments_of(dot_path)
     return along(value, path)[-1]
 
 
-def element_at(elements: list[T], index: int) -> list[T]:
-    """Returns the element at an index (negative: from the end); empty if there is none."""
-    return [elements[index]] if -len(elements) <= index < len(elements) else []
+def picked(elements: list[T], segment: str) -> list[T] | None:
+    """Returns the elements of a list that a segment picks: by an index, or as a `Selector`.
+
+    None if the segment is the name of a field.
+    """
+    if INDEX.fullmatch(segment):
+        index = int(segment)
+        return [elements[index]] if -len(elements) <= index < len(elements) else []
+    selector = Selector.of(segment)
+    if selector is None:
+        return None
+    objects = (element for element in elements if isinstance(element, dict))
+    return [element for element in objects if selector.accepts(element.get(selector.field))]
 
 
 def along(
-    value: T, path: Sequence[str], pick: Callable[[list[T], int], list[T]] = element_at
+    value: T, path: Sequence[str], pick: Callable[[list[T], str], list[T] | None] = picked
 ) -> list[list[T]]:
     """Returns the parts that each beginning of a path leads to: first the value, last the targets.
 
-    `pick` returns the element of a list at an index, as `element_at` does.
+    `pick` returns the elements of a list that a segment picks, as `picked` does.
     """
     nodes = [[value]]
     for segment in path:
@@ -527,7 +541,7 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> Iterator[T]:
+def _descend(node: T, segment: str, pick: Callable[[list[T], str], list[T] | None]) -> Iterator[T]:
     """Yields the parts of a node that one segment of a dot-path leads to."""
     if isinstance(node, dict):
         if segment in node:
@@ -535,11 +549,12 @@ def _descend(node: T, segment: str, pick: Callable[[list[T], int], list[T]]) -> 
         elif segment in _AXES and node.keys() == _POINT:
             yield node[_AXES[segment]]
     elif isinstance(node, list):
-        if INDEX.fullmatch(segment):
-            yield from pick(node, int(segment))
-        else:
-            for element in node:
-                yield from _descend(element, segment, pick)
+        chosen = pick(node, segment)
+        if chosen is not None:
+            yield from chosen
+            return
+        for element in node:
+            yield from _descend(element, segment, pick)
     elif isinstance(node, str) and looks_like_json(node):
         yield from _descend(cast("T", parsed_json(node)), segment, pick)
 

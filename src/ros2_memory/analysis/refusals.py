@@ -22,7 +22,13 @@ from ros2_memory.analysis.conditions import (
     positions,
 )
 from ros2_memory.core.text import listed, looks_like_json
-from ros2_memory.messages.conversions import NamedNumber, Summary, names_beside
+from ros2_memory.messages.conversions import (
+    NamedNumber,
+    Summary,
+    names_beside,
+    segments_of,
+    without_selectors,
+)
 from ros2_memory.messages.detections import parsed_json
 
 if TYPE_CHECKING:
@@ -46,7 +52,7 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
         if _is_unknown_below(value, field):
             return None
         targets = at_field(value, field)
-        if not targets:
+        if not targets and not at_field(value, without_selectors(field)):
             fields = f"{_paths(value, field)}{_hint_on_json(value)}"
             return f"the values have no field {field!r}; their fields are: {fields}"
     return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
@@ -80,7 +86,7 @@ def lack_in_json(field: str, value: JsonValue) -> str | None:
     Other messages may have the field, so that this is no refusal.
     """
     text = _json_text(value)
-    if text is None or not field.startswith("value.") or at_field(value, field):
+    if text is None or not field.startswith("value.") or at_field(value, without_selectors(field)):
         return None
     return f"its newest JSON has no {field}, but {_fields_of_json(text)}"
 
@@ -143,7 +149,7 @@ def shows_field(value: JsonValue, dot_path: str) -> bool:
     One does not if the field lies below an empty list or a null. Nor does one that lacks a named
     element (`positions.elbow`), since several nodes may publish some joints each.
     """
-    if _is_unknown_below(value, dot_path):
+    if _is_unknown_below(value, dot_path) or without_selectors(dot_path) != dot_path:
         return False
     return bool(at_field(value, dot_path)) or not names_beside(value, dot_path)
 
@@ -190,7 +196,7 @@ def _is_array(value: JsonValue) -> bool:
 
 def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether the path leads through an empty list, a null, or JSON, which may differ."""
-    nodes = chain.from_iterable(along(value, dot_path.split("."))[:-1])
+    nodes = chain.from_iterable(along(value, segments_of(dot_path))[:-1])
     return any(node is None or node == [] or _is_json(node) for node in nodes)
 
 

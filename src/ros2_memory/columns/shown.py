@@ -36,6 +36,7 @@ from ros2_memory.columns.values import (
     at_name,
     at_place,
     where_longer,
+    where_selected,
     within_limits,
 )
 from ros2_memory.core.arrays import stable_order
@@ -45,12 +46,14 @@ from ros2_memory.messages.conversions import (
     ANGLES,
     INDEX,
     SUMMARIZED,
+    Selector,
     Summary,
     ValueKind,
     kind_of_type,
     label_names,
     names_beside,
     own_path,
+    segments_of,
 )
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
@@ -173,7 +176,7 @@ class Shape:
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        name, *inner = segments = path.split(".")
+        name, *inner = segments = segments_of(path)
         node: Node | None = None
         if name in self._fields:
             mapped = self.at(self._fields[name])
@@ -363,8 +366,10 @@ def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | 
             node = Listing(node.level, leaf)
         if node is NOTHING:
             return node
+        if Selector.of(segment) is not None:
+            raise UnknownShapeError(f"which elements {segment} selects depends on the message")
         if isinstance(node, list) and segment.isascii() and segment.isdecimal():
-            node = next(iter(element_at(node, int(segment[:10]))), NOTHING)
+            node = next(iter(_picked(node, segment[:9]) or ()), NOTHING)
             continue
         if isinstance(node, Listing):
             inner = _descend(node.element, path[nth:], parts=parts)
@@ -408,7 +413,7 @@ def at_field(root: Node, dot_path: str) -> list[Node]:
     leaf = names.element if isinstance(names, Listing) else None
     if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT and isinstance(array, list):
         return _named_elements(array, leaf, name)
-    by_segment = conditions.along(root, dot_path.split("."), element_at)
+    by_segment = conditions.along(root, segments_of(dot_path), _picked)
     if any(UNKNOWN in nodes for nodes in by_segment):
         raise UnknownShapeError(f"{dot_path} leads to a part that is not known")
     return by_segment[-1]
@@ -416,10 +421,10 @@ def at_field(root: Node, dot_path: str) -> list[Node]:
 
 def texts_above(root: Node, dot_path: str) -> Iterator[tuple[Leaf, str]]:
     """Yields the texts on a dot-path, which may be JSON, each with the rest of the path."""
-    path = dot_path.split(".")
-    for nth, nodes in enumerate(conditions.along(root, path, element_at)[1:-1], 1):
-        # A number picks an element of a list, which is the next node.
-        is_pick = INDEX.fullmatch(path[nth]) is not None
+    path = segments_of(dot_path)
+    for nth, nodes in enumerate(conditions.along(root, path, _picked)[1:-1], 1):
+        # An index or a selector picks elements of a list, which are the next nodes.
+        is_pick = conditions.picked([], path[nth]) is not None
         for node in nodes:
             if is_pick and isinstance(node, list):
                 continue
@@ -441,11 +446,23 @@ def _named_elements(array: list[Node], names: Leaf, name: str) -> list[Node]:
     return [with_limit(array.element, at_name(array.level, names, name)), *sizes]
 
 
-def element_at(nodes: list[Node], index: int) -> list[Node]:
-    """Returns the element of a list at a place, if there may be one."""
+def _picked(nodes: list[Node], segment: str) -> list[Node] | None:
+    """Returns the elements of a list that a segment may pick, as `conditions.picked`.
+
+    Raises:
+        UnknownShapeError: it depends on the message.
+    """
+    is_listing, selector = isinstance(nodes, Listing), Selector.of(segment)
+    if selector is None and not (is_listing and INDEX.fullmatch(segment)):
+        return None if is_listing else conditions.picked(nodes, segment)
     if not isinstance(nodes, Listing):
-        return conditions.element_at(nodes, index)
-    return [with_limit(nodes.element, at_place(nodes.level, index))]
+        raise UnknownShapeError(f"elements that {segment} selects have columns of their own")
+    if selector is None:
+        return [with_limit(nodes.element, at_place(nodes.level, int(segment)))]
+    leaf = nodes.element.get(selector.field) if isinstance(nodes.element, dict) else None
+    if not isinstance(leaf, Leaf) or leaf.level != nodes.level:
+        raise UnknownShapeError(f"{selector.field} is no field of the elements themselves")
+    return [with_limit(nodes.element, where_selected(leaf, selector))]
 
 
 def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:

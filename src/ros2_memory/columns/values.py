@@ -19,8 +19,9 @@ from ros2_memory.columns.stored import StoredTable, Zones
 from ros2_memory.columns.table import IN_PART, MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.core.arrays import Floats, row_sums
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
+from ros2_memory.core.text import looks_like_json
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.messages.conversions import ANGLES, euler_of
+from ros2_memory.messages.conversions import ANGLES, Selector, euler_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -509,6 +510,29 @@ def at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Lim
         return TruthValues.known(places == place_in_row[rows])
 
     return Limit(level, find)
+
+
+def where_selected(leaf: Leaf, selector: Selector) -> Limit:
+    """Returns the limit to the elements of which a leaf has the value that a selector wants."""
+
+    def find(values: Values, positions: IntArray) -> TruthValues:
+        if leaf.kind is Kind.TEXT:
+            texts = values.texts(leaf)
+            are_accepted = texts.are(selector.accepts)[positions]
+            # JSON may lose detections of a low score, and is another text then.
+            may_change = texts.are(looks_like_json)[positions] & (leaf.json_depth > 0)
+            return TruthValues(are_accepted & ~may_change, are_accepted | may_change)
+        if leaf.kind is Kind.REAL or leaf.conversion is not Conversion.STORED:
+            raise UnknownShapeError(f"{leaf.sources[0]} may be rounded")
+        names, kind = dict(leaf.names), bool if leaf.kind is Kind.BOOLEAN else int
+        distinct, nth = np.unique(values.numbers(leaf).values[positions], return_inverse=True)
+        are_selected = [
+            selector.accepts(kind(value)) or names.get(int(value)) == selector.wanted
+            for value in distinct.tolist()
+        ]
+        return TruthValues.known(np.array(are_selected, np.bool_)[nth])
+
+    return Limit(leaf.level, find)
 
 
 def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) -> Limit:

@@ -23,7 +23,13 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, START_SLACK_NS, Ns
 from ros2_memory.history.context import READING_S, UNDECODED, Note
 from ros2_memory.history.lasting import TEXT, Lasting
 from ros2_memory.history.scan import blocks, of_columns, scan
-from ros2_memory.messages.conversions import Summary, names_beside, names_others, single_values
+from ros2_memory.messages.conversions import (
+    Summary,
+    names_beside,
+    names_others,
+    segments_of,
+    single_values,
+)
 from ros2_memory.messages.to_json import round_integer, round_real
 
 if TYPE_CHECKING:
@@ -178,7 +184,7 @@ class HeldValues:
         """Returns which single value to ask for if the field leads through a list; else nothing."""
         value = self._view.example(stored)
         own = self._field and self._view.extractor.own_path(self._field, stored.type)
-        path = own.split(".") if own else []
+        path = segments_of(own) if own else []
         for nth in range(1, len(path) + 1):
             of_first = ".".join((*path[:nth], "0", *path[nth:]))
             found = at_field(value, of_first)

@@ -39,6 +39,11 @@ _ELEMENT_NAMES: Final = ("names", "name", "joint_names")
 INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 """The place of an element in a path; a negative one counts from the end."""
 
+_BRACKETS: Final = re.compile(r"\.?\[(?:(-?\d{1,9})|(\w+=[^\]]*))\]")
+_BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])")
+"""A dot that is not in brackets."""
+_SELECTOR: Final = re.compile(r"\[(\w+)=([^\]]*)\]")
+
 Segments: TypeAlias = tuple[str, ...]
 
 _PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.([A-Za-z][A-Za-z0-9_]*|[0-9]+))*")
@@ -135,6 +140,48 @@ def names_of(node: object) -> tuple[str, ...]:
     return () if layout is None else tuple(layout.fields)
 
 
+def dotted_brackets(path: str) -> str:
+    """Returns a dot-path with `.3` for `[3]`, and `.[name=left]` for `[name=left]`."""
+    return _BRACKETS.sub(lambda found: f".{found[1] or f'[{found[2]}]'}", path).removeprefix(".")
+
+
+def segments_of(path: str) -> list[str]:
+    """Returns the segments of a dot-path; dots in brackets part none."""
+    return _BETWEEN_SEGMENTS.split(path)
+
+
+def without_selectors(path: str) -> str:
+    """Returns a dot-path that leads to all elements of lists in place of selected ones."""
+    return ".".join(part for part in segments_of(path) if Selector.of(part) is None)
+
+
+class Selector(NamedTuple):
+    """Which elements of a list a segment of a path selects: `[name=left]`, by a field of theirs."""
+
+    field: str
+    wanted: str
+
+    @classmethod
+    def of(cls, segment: str) -> Selector | None:
+        """Returns the selector that a segment is; None for any other segment."""
+        found = _SELECTOR.fullmatch(segment)
+        return None if found is None else cls(*found.groups())
+
+    def accepts(self, value: object) -> bool:
+        """Returns whether a value is the wanted text, number or boolean, or has its name."""
+        if isinstance(value, NamedNumber) and value.name == self.wanted:
+            return True
+        if isinstance(value, bool | np.bool_):
+            return self.wanted.lower() == str(value).lower()
+        own = number(value)
+        if own is None:
+            return value == self.wanted
+        try:
+            return own == float(self.wanted)
+        except ValueError:
+            return False
+
+
 def parse_path(path: str) -> Segments | None:
     """Returns the segments of a dot-path (`pose.pose.position`, `poses.0`); None if malformed."""
     return tuple(path.split(".")) if _PATH.fullmatch(path) else None
@@ -150,7 +197,7 @@ def descend(
 
     Args:
         node: a message, a JSON value or a part of one.
-        segments: of the path; a whole number is an index.
+        segments: of the path; a whole number is an index, `[name=left]` a `Selector`.
         step: returns the field of a node, or ABSENT.
     """
     for at, segment in enumerate(segments):
@@ -162,6 +209,8 @@ def descend(
             # An index of ten digits or more is past the end of any list.
             index = int(segment) if len(segment) < 10 else len(node)
             node = node[index] if index < len(node) else None
+        elif selector := Selector.of(segment):
+            node = [element for element in node if selector.accepts(step(element, selector.field))]
         else:
             return _descend_each(node, segments[at:], step)
     return node
@@ -198,7 +247,7 @@ def own_path(path: str, fields: Mapping[str, Sequence[str]]) -> str:
     For an odometry it returns `position.x` for `pose.pose.position.x`. A path that no mapped field
     leads to is returned as it is, and so is one that begins with the name of another field.
     """
-    segments = tuple(path.split("."))
+    segments = tuple(segments_of(path))
     longest, own_name = 0, ""
     for name, mapped in fields.items():
         is_other = segments[0] in fields and name != segments[0]

@@ -41,6 +41,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.conditions import Sought
 from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.messages.conversions import dotted_brackets
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""
@@ -71,7 +72,6 @@ _FOR_LONGER: Final = ": for a longer time give start and end, without around and
 
 _RELATIVE: Final = re.compile(r"-.*|.*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
 """Times before now, as people write them."""
-_INDEX: Final = re.compile(r"\[(\d+)\]")
 _WITHOUT_DATE: Final = re.compile(r"today|yesterday|\d{1,2}:\d\d")
 _AGO: Final = "for a time before now give seconds_ago, seconds or last_s, where a tool has it"
 _DATE: Final = "give the date, too: now_local of data_time_range has today's"
@@ -213,11 +213,6 @@ def _check_name(value: str) -> str:
     return _check_text(value, LONGEST_NAME)
 
 
-def _with_dots(path: str) -> str:
-    """Returns a dot-path with the indices of lists as planners also write them: `data[3]`."""
-    return _INDEX.sub(r".\1", path)
-
-
 def _check_unix(seconds: float) -> float:
     if seconds > LATEST_UNIX_S:
         raise ValueError("is too large for Unix seconds; is it in milliseconds or nanoseconds?")
@@ -280,7 +275,7 @@ _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
     _Name, Field(description="Topic or glob.", examples=["/vision/*/scene_objects"])
 ]
-_FieldName: TypeAlias = Annotated[_Name, AfterValidator(_with_dots)]
+_FieldName: TypeAlias = Annotated[_Name, AfterValidator(dotted_brackets)]
 _Fields: TypeAlias = Annotated[
     tuple[_FieldName, ...],
     BeforeValidator(_as_names),
@@ -361,7 +356,7 @@ _ConditionValue: TypeAlias = Annotated[
         }
     ),
 ]
-_SearchField: TypeAlias = Annotated[_FieldName, Field(description="Dot-path to test.")]
+_SearchField: TypeAlias = Annotated[_FieldName, Field(description="E.g. status[name=arm].level.")]
 
 
 _By: TypeAlias = Annotated[

@@ -1,5 +1,6 @@
 """Messages drawn at random as tables, and conditions drawn from what the messages say."""
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -30,6 +31,7 @@ from ros2_memory.columns.plan import plan_of
 from ros2_memory.columns.stored import Layout, StoredTable, columns_in, lazy_columns
 from ros2_memory.columns.table import Column, Table, Texts
 from ros2_memory.core.model import JsonValue
+from ros2_memory.core.text import looks_like_json
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.mcap_reader import McapReader
@@ -325,7 +327,7 @@ def _quaternion(random: Random) -> object:
 
 
 def paths_of(value: JsonValue, path: str = "") -> Iterator[str]:
-    """The dot-paths of a value, through lists with and without a place."""
+    """The dot-paths of a value, through lists with and without a place, or a selected element."""
     if isinstance(value, dict):
         for name, inner in value.items():
             below = f"{path}.{name}" if path else name
@@ -337,12 +339,19 @@ def paths_of(value: JsonValue, path: str = "") -> Iterator[str]:
             if path:
                 yield f"{path}.{place}"
                 yield from paths_of(value[place], f"{path}.{place}")
+        for name, own in value[-1].items() if path and isinstance(value[-1], dict) else ():
+            shown = json.dumps(own) if isinstance(own, int) else own
+            if isinstance(shown, str) and "]" not in shown and not looks_like_json(shown):
+                yield f"{path}.[{name}={shown}]"
+                yield from paths_of(value[-1], f"{path}.[{name}={shown}]")
 
 
 def condition_on(values: Sequence[JsonValue], random: Random) -> Condition:
     """A condition that some of the values meet, or nearly."""
     value = random.choice(values)
     paths = [*dict.fromkeys(paths_of(value))]
+    selecting = [path for path in paths if "=" in path]
+    paths = selecting if selecting and random.random() < 0.3 else paths
     field = random.choice(paths) if paths and random.random() < 0.75 else None
     if field is not None and random.random() < 0.05:
         field += random.choice([".nothing", ".1", ".-3"])

@@ -1,0 +1,88 @@
+"""One element of a list, selected by what one of its fields says: `status[name=left].level`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ros2_memory.history.context import Memory
+from tests.support.bags import Msg, diagnostics, text, write_mcap
+from tests.support.memories import asked, each_way, memory_of
+
+T0_S = 1_700_000_000
+S = 10**9
+RIGHT = {"start": T0_S, "end": T0_S + 100}
+
+
+def health(second: int, left: int, right: int) -> Msg:
+    return diagnostics((T0_S + second) * S, left=(left, "m"), right=(right, "m"))
+
+
+def shelf(second: int, **stock: int) -> Msg:
+    items = [{"name": name.replace("_", " "), "stock": count} for name, count in stock.items()]
+    return text((T0_S + second) * S, json.dumps({"items": items}), "/shelf")
+
+
+@pytest.fixture
+def messages() -> list[Msg]:
+    """The left one is in ERROR from 30 to 49 s, the right one warns from 10 to 89 s."""
+    levels = (health(n, 2 * (30 <= n < 50), int(10 <= n < 90)) for n in range(100))
+    stocks = (shelf(n, oat_milk=max(4 - n // 20, 0), bread=7) for n in range(0, 100, 5))
+    return sorted([*levels, *stocks], key=lambda message: message.log_time)
+
+
+@pytest.fixture
+def memory(tmp_path: Path, messages: list[Msg], recalls: bool) -> Memory:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    return memory_of(tmp_path, recalls=recalls)
+
+
+def spans(memory: Memory, topic: str, **condition: Any) -> list[tuple[int, int]]:
+    found = asked(memory, "find_matches", topic=topic, **condition, **RIGHT)
+    return [
+        (round(each["first_seen"]) - T0_S, round(each["last_seen"]) - T0_S)
+        for each in found["sightings"]
+    ]
+
+
+@each_way
+def test_a_condition_is_tested_on_the_selected_element_alone(memory: Memory) -> None:
+    warns = {"condition_type": "above", "value": 0}
+    assert spans(memory, "/diagnostics", field="status[name=left].level", **warns) == [(30, 49)]
+    assert spans(memory, "/diagnostics", field="status[name=right].level", **warns) == [(10, 89)]
+    assert spans(memory, "/diagnostics", field="status.level", **warns) == [(10, 89)]
+    error = {"condition_type": "equals", "value": "left"}
+    assert spans(memory, "/diagnostics", field="status[level=2].name", **error) == [(30, 49)]
+    assert spans(memory, "/diagnostics", field="status[name=none].level", **warns) == []
+
+
+@each_way
+def test_json_has_selected_elements_too(memory: Memory) -> None:
+    gone = {"condition_type": "equals", "value": 0}
+    assert spans(memory, "/shelf", field="data.items[name=oat milk].stock", **gone) == [(80, 95)]
+    assert spans(memory, "/shelf", field="data.items[name=bread].stock", **gone) == []
+    out = {"condition_type": "contains", "value": "milk"}
+    assert spans(memory, "/shelf", field="data.items[stock=0].name", **out) == [(80, 95)]
+
+
+@each_way
+def test_fields_show_the_selected_elements(memory: Memory) -> None:
+    given = {"timestamp": T0_S + 40, "fields": ["status[name=left].level", "status[level=1].name"]}
+    reply = asked(memory, "get_topic_at_time", topic="/diagnostics", **given)
+    assert [*reply["value"].values()] == [[2], ["right"]]
+    stock = ["data.items[name=oat milk].stock"]
+    by_hour = asked(memory, "get_topic_in_range", topic="/shelf", fields=stock, by="hour", **RIGHT)
+    [row] = by_hour["rows"]
+    cells = dict(zip(by_hour["columns"], row, strict=True))
+    greatest = next(cells[name] for name in cells if name.endswith("stock.max"))
+    least = next(cells[name] for name in cells if name.endswith("stock.min"))
+    assert (least, greatest) == (0, 4)
+
+
+@each_way
+def test_a_field_that_no_element_has_is_refused(memory: Memory) -> None:
+    asking = {"condition_type": "above", "value": 0, "field": "status[name=left].height"}
+    refused = asked(memory, "find_matches", topic="/diagnostics", **asking, **RIGHT)
+    assert refused["error"] == "invalid_arguments"
+    assert "status.level" in refused["detail"]
