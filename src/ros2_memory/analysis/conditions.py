@@ -22,10 +22,10 @@ from ros2_memory.messages.conversions import (
     NamedNumber,
     Selector,
     Summary,
-    dotted_brackets,
     names_beside,
     names_others,
     segments_of,
+    with_dots,
 )
 from ros2_memory.messages.detections import detections_of, parsed_json, without_low_scores
 
@@ -392,7 +392,7 @@ def parse_condition(
     Raises:
         InvalidArgumentsError: an argument is invalid; the message says why and gives an example.
     """
-    path = dotted_brackets((field or "").strip()) or None
+    path = with_dots((field or "").strip()) or None
     test = _parse_test(condition_type, value, tolerance_m)
     if isinstance(test, Beyond) and path is None:
         raise InvalidArgumentsError(
@@ -407,7 +407,7 @@ def at_field(value: T, dot_path: str) -> list[T]:
 
     In a list the path goes on in every element: `detections.label` gives all labels. A whole number
     picks one element (negative: from the end): `detections.0.label` gives the first label, and
-    `status.[name=left].level` the levels of elements with that name. A number picks an axis of a
+    `status[name=left].level` the levels of elements with that name. A number picks an axis of a
     point, too. `positions.elbow` of joint states gives the position beside
     `elbow` in the list of names. In a text that is JSON the path goes on, too.
     """

@@ -24,6 +24,7 @@ from ros2_memory.analysis.conditions import (
 from ros2_memory.core.text import listed, looks_like_json
 from ros2_memory.messages.conversions import (
     NamedNumber,
+    Selector,
     Summary,
     names_beside,
     segments_of,
@@ -89,6 +90,22 @@ def lack_in_json(field: str, value: JsonValue) -> str | None:
     if text is None or not field.startswith("value.") or at_field(value, without_selectors(field)):
         return None
     return f"its newest JSON has no {field}, but {_fields_of_json(text)}"
+
+
+def lack_of_element(field: str, value: JsonValue) -> str | None:
+    """Returns that no element of a list is one that a path selects, and what they say; else None.
+
+    Other messages may have it, so that this is no refusal.
+    """
+    path = segments_of(field)
+    for nth, segment in enumerate(path):
+        selector = Selector.of(segment)
+        if selector is not None and not along(value, path[: nth + 1])[-1]:
+            said = along(value, [*path[:nth], selector.field])[-1]
+            named = [part.name if isinstance(part, NamedNumber) else str(part) for part in said]
+            others = f", but {listed([*dict.fromkeys(named)])}" if named else ""
+            return f"no element of its newest message has {segment[1:-1]}{others}"
+    return None
 
 
 def _refusal_for_position(value: JsonValue) -> str | None:

@@ -39,9 +39,9 @@ _ELEMENT_NAMES: Final = ("names", "name", "joint_names")
 INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 """The place of an element in a path; a negative one counts from the end."""
 
-_BRACKETS: Final = re.compile(r"\.?\[(?:(-?\d{1,9})|(\w+=[^\]]*))\]")
-_BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])")
-"""A dot that is not in brackets."""
+_INDEX_IN_BRACKETS: Final = re.compile(r"\[(-?\d{1,9})\]")
+_BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])|(?<!\.)(?=\[\w+=)")
+"""A dot that is not in brackets, or where a selector begins."""
 _SELECTOR: Final = re.compile(r"\[(\w+)=([^\]]*)\]")
 
 Segments: TypeAlias = tuple[str, ...]
@@ -140,13 +140,13 @@ def names_of(node: object) -> tuple[str, ...]:
     return () if layout is None else tuple(layout.fields)
 
 
-def dotted_brackets(path: str) -> str:
-    """Returns a dot-path with `.3` for `[3]`, and `.[name=left]` for `[name=left]`."""
-    return _BRACKETS.sub(lambda found: f".{found[1] or f'[{found[2]}]'}", path).removeprefix(".")
+def with_dots(path: str) -> str:
+    """Returns a dot-path with the indices of lists as planners also write them: `data[3]`."""
+    return _INDEX_IN_BRACKETS.sub(r".\1", path)
 
 
 def segments_of(path: str) -> list[str]:
-    """Returns the segments of a dot-path; dots in brackets part none."""
+    """Returns the segments of a dot-path; `status[name=left]` are two."""
     return _BETWEEN_SEGMENTS.split(path)
 
 
@@ -164,7 +164,8 @@ class Selector(NamedTuple):
     @classmethod
     def of(cls, segment: str) -> Selector | None:
         """Returns the selector that a segment is; None for any other segment."""
-        found = _SELECTOR.fullmatch(segment)
+        # Nearly all segments are names: they are not matched.
+        found = _SELECTOR.fullmatch(segment) if segment.startswith("[") else None
         return None if found is None else cls(*found.groups())
 
     def accepts(self, value: object) -> bool:
@@ -193,7 +194,8 @@ def descend(
     """Returns what is at a path: None below a null or past the end of a list, else ABSENT.
 
     A name after a list is looked up in each element: the result is a list with None for elements
-    that lack it, and ABSENT if all of them do.
+    that lack it, and ABSENT if all of them do. A selector leads to the element itself, to None or
+    to a list if none or several are selected.
 
     Args:
         node: a message, a JSON value or a part of one.
@@ -210,7 +212,8 @@ def descend(
             index = int(segment) if len(segment) < 10 else len(node)
             node = node[index] if index < len(node) else None
         elif selector := Selector.of(segment):
-            node = [element for element in node if selector.accepts(step(element, selector.field))]
+            chosen = [part for part in node if selector.accepts(step(part, selector.field))]
+            node = chosen[0] if len(chosen) == 1 else chosen or None
         else:
             return _descend_each(node, segments[at:], step)
     return node

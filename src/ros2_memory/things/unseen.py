@@ -18,7 +18,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.facts import GOALS
-from ros2_memory.analysis.refusals import fields_of_constant, lack_in_json
+from ros2_memory.analysis.refusals import fields_of_constant, lack_in_json, lack_of_element
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Spot, Unplaced
 from ros2_memory.core.arrays import Columns, Flags, Ints, distinct_rows, numbered, rows_by
 from ros2_memory.core.errors import (
@@ -255,7 +255,7 @@ def notes_on_never(
     return (
         *_score_limit(condition, sought.min_score),
         *_named_numbers(view, topics, condition),
-        *_lacks_in_json(view, topics, condition),
+        *_lacks_in_newest(view, topics, condition),
         *(note for frame in sorted(frames) for note in axes_of(frame)),
         *meant,
     )
@@ -269,13 +269,14 @@ def _score_limit(condition: Condition, min_score: float | None) -> tuple[str, ..
     return (f"detections with a score below {condition.min_score:g} do not count here, {unless}",)
 
 
-def _lacks_in_json(view: View, topics: Sequence[str], condition: Condition) -> Iterator[str]:
-    """Yields a note for "never" on each topic whose newest JSON lacks the field."""
+def _lacks_in_newest(view: View, topics: Sequence[str], condition: Condition) -> Iterator[str]:
+    """Yields a note for "never" on each topic whose newest message lacks the field, if JSON may."""
     for topic in topics[:_MOST_TYPES] if condition.field else ():
         stored = view.stream.last(topic)
         if stored is not None:
             field = condition.of_type(stored.type, view.extractor).field or ""
-            lack = lack_in_json(field, view.example(stored))
+            value = view.example(stored)
+            lack = lack_of_element(field, value) or lack_in_json(field, value)
             if lack is not None:
                 yield f"{topic}: {lack}"
 

@@ -41,7 +41,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.conditions import Sought
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.messages.conversions import dotted_brackets
+from ros2_memory.messages.conversions import with_dots
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""
@@ -275,7 +275,7 @@ _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
     _Name, Field(description="Topic or glob.", examples=["/vision/*/scene_objects"])
 ]
-_FieldName: TypeAlias = Annotated[_Name, AfterValidator(dotted_brackets)]
+_FieldName: TypeAlias = Annotated[_Name, AfterValidator(with_dots)]
 _Fields: TypeAlias = Annotated[
     tuple[_FieldName, ...],
     BeforeValidator(_as_names),

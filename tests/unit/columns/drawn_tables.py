@@ -342,8 +342,8 @@ def paths_of(value: JsonValue, path: str = "") -> Iterator[str]:
         for name, own in value[-1].items() if path and isinstance(value[-1], dict) else ():
             shown = json.dumps(own) if isinstance(own, int) else own
             if isinstance(shown, str) and "]" not in shown and not looks_like_json(shown):
-                yield f"{path}.[{name}={shown}]"
-                yield from paths_of(value[-1], f"{path}.[{name}={shown}]")
+                yield f"{path}[{name}={shown}]"
+                yield from paths_of(value[-1], f"{path}[{name}={shown}]")
 
 
 def condition_on(values: Sequence[JsonValue], random: Random) -> Condition:

@@ -70,7 +70,7 @@ def test_json_has_selected_elements_too(memory: Memory) -> None:
 def test_fields_show_the_selected_elements(memory: Memory) -> None:
     given = {"timestamp": T0_S + 40, "fields": ["status[name=left].level", "status[level=1].name"]}
     reply = asked(memory, "get_topic_at_time", topic="/diagnostics", **given)
-    assert [*reply["value"].values()] == [[2], ["right"]]
+    assert [*reply["value"].values()] == [2, "right"]
     stock = ["data.items[name=oat milk].stock"]
     by_hour = asked(memory, "get_topic_in_range", topic="/shelf", fields=stock, by="hour", **RIGHT)
     [row] = by_hour["rows"]
@@ -78,6 +78,18 @@ def test_fields_show_the_selected_elements(memory: Memory) -> None:
     greatest = next(cells[name] for name in cells if name.endswith("stock.max"))
     least = next(cells[name] for name in cells if name.endswith("stock.min"))
     assert (least, greatest) == (0, 4)
+
+
+@each_way
+def test_never_says_which_elements_there_are_if_none_is_selected(memory: Memory) -> None:
+    asking = {"condition_type": "above", "value": 0, "field": "status[name=lift].level"}
+    [note] = asked(memory, "find_last_match", topic="/diagnostics", **asking)["notes"]
+    lack = "/diagnostics: no element of its newest message has name=lift, but left, right"
+    assert note == lack
+    assert lack in asked(memory, "find_matches", topic="/diagnostics", **asking, **RIGHT)["notes"]
+    asking["field"] = "data.items[name=salt].stock"
+    reply = asked(memory, "find_last_match", topic="/shelf", **asking)
+    assert "has name=salt, but oat milk, bread" in reply["notes"][0]
 
 
 @each_way
