@@ -522,10 +522,11 @@ def where_selected(leaf: Leaf, selector: Selector) -> Limit:
             # JSON may lose detections of a low score, and is another text then.
             may_change = texts.are(looks_like_json)[positions] & (leaf.json_depth > 0)
             return TruthValues(are_accepted & ~may_change, are_accepted | may_change)
-        if leaf.kind is Kind.REAL or leaf.conversion is not Conversion.STORED:
-            raise UnknownShapeError(f"{leaf.sources[0]} may be rounded")
+        numbers = values.numbers(leaf).values
+        if leaf.kind is Kind.REAL or numbers.dtype.kind == "f":
+            raise UnknownShapeError(f"{leaf.sources[0]} may be rounded, or null")
         names, kind = dict(leaf.names), bool if leaf.kind is Kind.BOOLEAN else int
-        distinct, nth = np.unique(values.numbers(leaf).values[positions], return_inverse=True)
+        distinct, nth = np.unique(numbers[positions], return_inverse=True)
         are_selected = [
             selector.accepts(kind(value)) or names.get(int(value)) == selector.wanted
             for value in distinct.tolist()

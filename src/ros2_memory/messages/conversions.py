@@ -13,6 +13,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import suppress
 from enum import Enum, auto
 from functools import lru_cache, partial
 from operator import attrgetter
@@ -40,7 +41,7 @@ INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 """The place of an element in a path; a negative one counts from the end."""
 
 _INDEX_IN_BRACKETS: Final = re.compile(r"\[(-?\d{1,9})\]")
-_BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])|(?<!\.)(?=\[\w+=)")
+_BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])|(?<=[^.])(?=\[\w+=)")
 """A dot that is not in brackets, or where a selector begins."""
 _SELECTOR: Final = re.compile(r"\[(\w+)=([^\]]*)\]")
 
@@ -174,13 +175,12 @@ class Selector(NamedTuple):
             return True
         if isinstance(value, bool | np.bool_):
             return self.wanted.lower() == str(value).lower()
-        own = number(value)
-        if own is None:
+        if isinstance(value, str):
             return value == self.wanted
-        try:
-            return own == float(self.wanted)
-        except ValueError:
-            return False
+        for kind in (int, float):  # ids may have more digits than a float
+            with suppress(ValueError):
+                return bool(value == kind(self.wanted))
+        return False
 
 
 def parse_path(path: str) -> Segments | None:

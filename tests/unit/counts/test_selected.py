@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from ros2_memory.history.context import Memory
+from ros2_memory.messages.conversions import Selector, segments_of
 from tests.support.bags import Msg, diagnostics, text, write_mcap
 from tests.support.memories import asked, each_way, memory_of
 
@@ -90,6 +91,40 @@ def test_never_says_which_elements_there_are_if_none_is_selected(memory: Memory)
     asking["field"] = "data.items[name=salt].stock"
     reply = asked(memory, "find_last_match", topic="/shelf", **asking)
     assert "has name=salt, but oat milk, bread" in reply["notes"][0]
+
+
+@pytest.mark.parametrize(
+    ("path", "segments"),
+    [
+        ("status[name=a.b].level", ["status", "[name=a.b]", "level"]),
+        ("status.[name=a].level", ["status", "[name=a]", "level"]),
+        ("[id=7].x", ["[id=7]", "x"]),
+        ("a..b.-1", ["a", "", "b", "-1"]),
+    ],
+)
+def test_a_path_is_split_at_dots_and_before_what_selects(path: str, segments: list[str]) -> None:
+    assert segments_of(path) == segments
+
+
+@pytest.mark.parametrize(
+    ("wanted", "value", "is_selected"),
+    [
+        ("7", 7, True),
+        ("7", 7.0, True),
+        ("7", "7", True),
+        ("0.5", 0.5, True),
+        ("1234567890123456788", 1234567890123456789, False),
+        ("true", True, True),
+        ("1", True, False),
+        ("7", None, False),
+        ("x", [7], False),
+        ("Left", "left", False),
+    ],
+)
+def test_an_element_is_selected_by_a_text_a_number_or_a_boolean(
+    wanted: str, value: object, is_selected: bool
+) -> None:
+    assert Selector("id", wanted).accepts(value) is is_selected
 
 
 @each_way
