@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 45
+FORMAT: Final = 46
 """Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
 by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096

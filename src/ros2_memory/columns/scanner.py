@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.store import ColumnStore, PartHead, State
     from ros2_memory.columns.stored import Topic
-    from ros2_memory.columns.transforms import Pair
     from ros2_memory.core.errors import BagError
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
@@ -136,7 +135,6 @@ class Caches:
         zones: the zones of a column, by topic, path and the first of `_NEIGHBOURS` parts.
         heads: the parts of a topic, by its name.
         decoded: the tables of bags that are not stored, in groups, by file, topic and window.
-        pairs: the parents and children of transforms, by part.
         clock_steps: the steps of the clock in a pause, by the pause and the bags beside it.
         statics: the static transforms of sessions of a timeline, by topics.
         sights: what detectors saw in ten minutes, by these and what it is computed from.
@@ -147,7 +145,6 @@ class Caches:
     zones: ByteLru[_ColumnZones]
     heads: ByteLru[_Heads]
     decoded: ByteLru[list[list[Table]]]
-    pairs: ByteLru[frozenset[Pair]]
     clock_steps: ByteLru[tuple[ClockStep, ...]]
     statics: ByteLru[tuple[Timeline, Mapping[frozenset[str], Sequence[StampedTransform]]]]
     sights: ByteLru[object]

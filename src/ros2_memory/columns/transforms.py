@@ -143,6 +143,21 @@ STATICS: Final[FragmentKind[Statics]] = FragmentKind(
 """The static transforms of a part, exact."""
 
 
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """The parents and children of the valid transforms of a part."""
+
+    pairs: tuple[Pair, ...]
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 200 + 200 * len(self.pairs)
+
+
+PAIRS: Final[FragmentKind[Pairs]] = FragmentKind("pairs", (Pairs,))
+
+
 def stamped_between(rows: Rows, earliest: Ns, latest: Ns) -> Rows | None:
     """Returns the rows that have a transform stamped in a span (ns, inclusive).
 

@@ -24,7 +24,15 @@ from ros2_memory.analysis.frames import TF_CACHE_NS, is_edge, without_repeats
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_thinned, recorded_as
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.store import relative
-from ros2_memory.columns.transforms import STATICS, Pair, Statics, changing_rows, pairs_in
+from ros2_memory.columns.transforms import (
+    PAIRS,
+    STATICS,
+    Pair,
+    Pairs,
+    Statics,
+    changing_rows,
+    pairs_in,
+)
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
@@ -496,7 +504,7 @@ class Sessions:
 
     def pairs_back(
         self, topic: str, session: Session | None = None, window: TimeWindow | None = None
-    ) -> Iterator[tuple[Path, frozenset[Pair]]]:
+    ) -> Iterator[tuple[Path, Iterable[Pair]]]:
         """Yields the pairs of a topic (in a window), of a session or of all, the newest first.
 
         Each set is of one table, and comes with the recording of that.
@@ -509,26 +517,24 @@ class Sessions:
         ):
             if session is None or self.may_hold(session, rows.recording):
                 carried_of = session if self.holds_carried(rows.recording) else None
-                yield rows.recording, self._pairs_in(rows, carried_of)
+                yield rows.recording, self._pairs_in(rows, carried_of, window.start)
 
-    def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
-        """Returns the pairs in rows, of a session or of all; remembers those of a part."""
-        view, cache = self._view, self._view.memory.scanner.caches.pairs
-        part = rows.part if session is None else None
-        pairs = None if part is None else cache.get(part)
-        if pairs is not None:
-            return pairs
-        by_columns = None
-        with view.bags.watched() as reading:
-            if session is None:
-                by_columns = of_columns(view, rows, pairs_in)
+    def _pairs_in(self, rows: Rows, session: Session | None, start: Ns) -> Iterable[Pair]:
+        """Returns the pairs in rows, of a session or of all; remembers those of a part.
+
+        With a part, those of earlier ones are read back to `start`.
+        """
+
+        def make() -> Pairs:
+            by_columns = of_columns(self._view, rows, pairs_in) if session is None else None
             if by_columns is None:
                 received = self.received(session, rows)
                 by_columns = [frozenset((found.parent, found.child) for found in received)]
-        pairs = frozenset[Pair]().union(*by_columns)
-        if part is not None and reading.is_final:
-            cache.put(part, pairs, 200 + 200 * len(pairs))
-        return pairs
+            return Pairs(tuple(sorted(frozenset[Pair]().union(*by_columns))))
+
+        part = rows.part if session is None else None
+        key = None if part is None else FragmentKey(rows.first, "", (part,))
+        return remembered(self._view, PAIRS, key, make, also_before=rows.first - start).pairs
 
 
 def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:

@@ -303,6 +303,8 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
     """
     view = View(memory, Call(stored=True))
     deque(view.sessions.static_back(window), maxlen=0)
+    for topic in (*view.static_topics, *view.moving_topics):
+        deque(view.sessions.pairs_back(topic, window=window), maxlen=0)
     fragments = [
         make_drive_slices(view, window),
         make_tracks(view, window),

@@ -1,5 +1,6 @@
 """Transforms: the same however they are cut or stored, and whose hold at which time."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import count, groupby
 from pathlib import Path
@@ -13,6 +14,9 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.frames import static_at
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.bag_dir.layout import OWN_FOLDER
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
 from ros2_memory.history import sessions
 from ros2_memory.history.context import Call, Memory
@@ -20,9 +24,10 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, in_order, odom, tf, tf_of, transform, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 S = 10**9
 T0 = 1_784_000_000 * S
@@ -262,6 +267,29 @@ def test_frames_are_those_of_the_newest_bags_where_there_is_no_time_for_all(
     assert [names for names, _ in groupby(named)] == ["new", "new,old", "gone,new,old"]
     assert all(is_partial for names, is_partial in answers if "gone" not in names)
     assert answers[-1] == (["gone", "new", "old"], False)
+
+
+def test_which_frames_there_are_is_stored_though_columns_of_transforms_are_not(
+    tmp_path: Path,
+) -> None:
+    read: list[str] = []
+
+    class Noting(McapReader):
+        def batches(self, path: Path, topics: Collection[str], *args: Any, **given: Any) -> Any:
+            read.extend(topics)
+            return super().batches(path, topics, *args, **given)
+
+    driven = [*moving(T0, 60, "map", "odom", 1.0, 0.0), *moving(T0, 60, "odom", "base_link", 0, 1)]
+    record(tmp_path / "rec", in_order([*driven, fixed(T0, "base_link", "camera", 0.1)]))
+    memory = memory_of(tmp_path, reader=Noting())
+    with_store(memory, tmp_path, share=0.0)
+    assert "/tf" in read
+    read.clear()
+    store = ColumnStore([tmp_path / OWN_FOLDER / FILE], memory.reader.definition)
+    another = replace(memory, scanner=Scanner(store, tmp_path))  # of another process
+    found = asked(another, "list_frames")["frames"]
+    assert found == ["base_link", "camera", "map", "odom"]
+    assert not read
 
 
 @each_way
