@@ -452,13 +452,15 @@ def _picked(nodes: list[Node], segment: str) -> list[Node] | None:
     Raises:
         UnknownShapeError: it depends on the message.
     """
-    is_listing, selector = isinstance(nodes, Listing), Selector.of(segment)
-    if selector is None and not (is_listing and INDEX.fullmatch(segment)):
-        return None if is_listing else conditions.picked(nodes, segment)
+    selector = Selector.of(segment)
     if not isinstance(nodes, Listing):
+        if selector is None:
+            return conditions.picked(nodes, segment)
         raise UnknownShapeError(f"elements that {segment} selects have columns of their own")
-    if selector is None:
+    if INDEX.fullmatch(segment):
         return [with_limit(nodes.element, at_place(nodes.level, int(segment)))]
+    if selector is None:
+        return None
     leaf = nodes.element.get(selector.field) if isinstance(nodes.element, dict) else None
     if not isinstance(leaf, Leaf) or leaf.level != nodes.level:
         raise UnknownShapeError(f"{selector.field} is no field of the elements themselves")
