@@ -2,8 +2,7 @@
 
 A file of 0 bytes is deleted: nothing had reached the disk. A truncated file is rewritten beside
 itself from all that can be read of it, read back, compared and flushed. Only then does the new file
-take the name of the old one. In every other case the old file is unchanged, unless the error says
-that only its folder could not be flushed.
+take the name of the old one. In every other case the old file is unchanged.
 """
 
 from __future__ import annotations
@@ -104,7 +103,7 @@ class Repairer:
             raise BagError(str(here), "not a regular file")
         if not before.st_size:
             here.unlink()
-            _flush_after("deleted, since it was empty", here)
+            flush(here.parent)
             return Repaired(0)
         if self.reader.is_finished(path):
             return None
@@ -157,9 +156,10 @@ def rewrite_without(
         expected: how many messages go, by topic.
 
     Raises:
-        EpisodicError: the file cannot be rewritten, or another program rewrites it: it is
-            unchanged. Or it was rewritten, and its folder cannot be flushed.
-        OSError: the file cannot be rewritten, or is another one now.
+        EpisodicError: the file cannot be rewritten, or another program rewrites it; it is
+            unchanged.
+        OSError: the file cannot be rewritten, or is another one now; or it was rewritten, and its
+            folder cannot be flushed.
     """
     with open_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
@@ -179,28 +179,14 @@ def replace_file(new: Path, path: Path, before: os.stat_result) -> None:
     """Renames a new file to `path`, where the file must still be as it was `before`.
 
     Raises:
-        OSError: another file lies there, or none, or it was written to.
-        BagError: it was renamed, and the folder cannot be flushed.
+        OSError: another file lies there, or none, or it was written to; or it was renamed, and the
+            folder cannot be flushed.
     """
     after = path.lstat()
     if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
         raise OSError(f"{path.name} was written to meanwhile, or is another file")
     new.replace(path)
-    _flush_after("rewritten", path)
-
-
-def _flush_after(done: str, path: Path) -> None:
-    """Flushes the folder of a file to which something was done.
-
-    Raises:
-        BagError: it cannot be flushed; the sentence says what was done all the same.
-    """
-    try:
-        flush(path.parent)
-    except OSError as error:
-        why = f"its folder cannot be flushed ({error.strerror or error})"
-        undone = "after a power cut it may be as before"
-        raise BagError(str(path), f"it was {done}, but {why}: {undone}") from error
+    flush(path.parent)
 
 
 def correct_metadata_files(

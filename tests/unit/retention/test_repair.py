@@ -1,4 +1,3 @@
-import errno
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -8,13 +7,12 @@ import pytest
 from mcap.records import McapRecord
 
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention import repair
 from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, along_x, write_mcap
-from tests.support.fakes import broken, files_limited_to
+from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import files_in
 from tests.unit.storage.mcap.test_writer import contents
 
@@ -101,20 +99,6 @@ def test_a_file_stays_as_it_is_where_meanwhile(
         REPAIRER.repair(path)
     assert files_in(path.parent) == left
     assert not left or path.read_bytes().startswith(before)
-
-
-@pytest.mark.parametrize(("size", "done"), [(None, "rewritten"), (0, "deleted")])
-def test_what_was_done_is_said_where_the_folder_cannot_be_flushed(
-    path: Path, size: int | None, done: str
-) -> None:
-    if size is not None:
-        os.truncate(path, size)
-    with broken(repair, "flush", errno.EIO), pytest.raises(BagError) as raised:
-        REPAIRER.repair(path)
-    assert raised.value.path == str(path)
-    assert raised.value.reason.startswith(f"it was {done}")
-    assert path.exists() == (size is None)
-    assert not path.exists() or REPAIRER.is_whole(path)
 
 
 def test_links_are_not_followed(path: Path) -> None:
