@@ -442,7 +442,7 @@ class Housekeeping:
         if repaired is None:
             return False
         if repaired.rewritten is None:
-            _log.warning("empty_split_removed", path=str(path))
+            _log.warning("empty_split_removed", path=str(path), notes=list(repaired.notes))
             # In case all splits of the recording were empty.
             remove_emptied(self.bag_dir, path.parent)
             return True
@@ -454,7 +454,7 @@ class Housekeeping:
             is_bytes=repaired.is_bytes,
             cut_bytes=repaired.rewritten.lost_bytes,
             reason=repaired.rewritten.describe_loss(),
-            notes=list(repaired.rewritten.notes),
+            notes=list(repaired.notes),
             duration_ms=ms_since(begun),
         )
         return True

@@ -17,7 +17,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.handover_file import (
     MessageList,
     handover_to_change,
@@ -55,6 +54,7 @@ from ros2_memory.retention.delete import new_file_beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
     correct_metadata_files,
+    delete_file,
     open_files,
     open_folder,
     reason_of,
@@ -365,8 +365,7 @@ class Eraser:
             links = counted(left, "more hard link", "more hard links")
             return f"{self._relative(path)}: all of it is still in {links} of it"
         if is_carried(path) and self.reader.summarize(path).empty:
-            path.unlink()
-            flush(path.parent)
+            delete_file(path)
         return None
 
     def _replace_link(self, new: Path, path: Path, before: os.stat_result) -> None:

@@ -39,12 +39,18 @@ class Repaired(NamedTuple):
     """The result of repairing one file.
 
     `was_bytes` and `is_bytes` are its sizes before and after. `rewritten` describes what was
-    recovered; it is None for an empty file, which was removed.
+    recovered; it is None for an empty file, which was removed. `notes` are sentences on what was
+    lost, or may be undone.
     """
 
     was_bytes: int
     is_bytes: int = 0
     rewritten: Rewritten | None = None
+    notes: tuple[str, ...] = ()
+
+
+class UnflushedError(OSError):
+    """A file was replaced or deleted, and a power cut may undo that."""
 
 
 @dataclass(eq=False, repr=False)
@@ -76,8 +82,7 @@ class Repairer:
 
         Raises:
             BagVanishedError: the file does not exist.
-            BagError: the file cannot be repaired, and is unchanged; or it was repaired, or deleted
-                since it was empty, and its folder cannot be flushed.
+            BagError: the file cannot be repaired, and is unchanged.
         """
         try:
             with open_folder(self.root, path.absolute()) as here:
@@ -102,16 +107,24 @@ class Repairer:
         if not stat.S_ISREG(before.st_mode):
             raise BagError(str(here), "not a regular file")
         if not before.st_size:
-            here.unlink()
-            flush(here.parent)
-            return Repaired(0)
+            return Repaired(0, notes=_unflushed(lambda: delete_file(here)))
         if self.reader.is_finished(path):
             return None
         with new_file_beside(here) as new:
             result = self.writer.rewrite(here, new)
             _give_attributes(new, before, before.st_mtime_ns)
-            replace_file(new, here, before)
-        return Repaired(before.st_size, here.stat().st_size, result)
+            size = new.stat().st_size
+            notes = result.notes + _unflushed(lambda: replace_file(new, here, before))
+        return Repaired(before.st_size, size, result, notes)
+
+
+def _unflushed(change: Callable[[], None]) -> tuple[str, ...]:
+    """Changes a file; returns a note if a power cut may undo that."""
+    try:
+        change()
+    except UnflushedError as error:
+        return (str(error),)
+    return ()
 
 
 @contextmanager
@@ -158,8 +171,8 @@ def rewrite_without(
     Raises:
         EpisodicError: the file cannot be rewritten, or another program rewrites it; it is
             unchanged.
-        OSError: the file cannot be rewritten, or is another one now; or it was rewritten, and its
-            folder cannot be flushed.
+        UnflushedError: it was rewritten, and a power cut may undo that.
+        OSError: the file cannot be rewritten, or is another one now.
     """
     with open_folder(bag_dir, path) as here, here.open("rb") as old:
         try:
@@ -179,14 +192,35 @@ def replace_file(new: Path, path: Path, before: os.stat_result) -> None:
     """Renames a new file to `path`, where the file must still be as it was `before`.
 
     Raises:
-        OSError: another file lies there, or none, or it was written to; or it was renamed, and the
-            folder cannot be flushed.
+        UnflushedError: it was renamed, and a power cut may undo that.
+        OSError: another file lies there, or none, or it was written to.
     """
     after = path.lstat()
     if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
         raise OSError(f"{path.name} was written to meanwhile, or is another file")
     new.replace(path)
-    flush(path.parent)
+    _flush_change(path)
+
+
+def delete_file(path: Path) -> None:
+    """Deletes a file.
+
+    Raises:
+        UnflushedError: it was deleted, and a power cut may undo that.
+        OSError: it cannot be deleted.
+    """
+    path.unlink()
+    _flush_change(path)
+
+
+def _flush_change(path: Path) -> None:
+    try:
+        flush(path.parent)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UnflushedError(
+            f"{path.name} was changed, and a power cut may undo that: {reason}"
+        ) from error
 
 
 def correct_metadata_files(

@@ -30,7 +30,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.policy import DirContents, RetentionLimits, bags_older_than
-from ros2_memory.retention.repair import rewrite_without
+from ros2_memory.retention.repair import UnflushedError, rewrite_without
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -195,7 +195,7 @@ class TopicCutter:
 
         Raises:
             EpisodicError: the bag cannot be rewritten; nothing is changed.
-            OSError: the same; or the bag was cut, and its folder cannot be flushed.
+            OSError: the same.
         """
         path = cut.bag.path
         before = path.lstat()
@@ -230,12 +230,13 @@ class TopicCutter:
                 if receipt is not None:
                     shipped = replace(receipt, size=new.stat().st_size)
                     SHIPPED.append(self.bag_dir, [shipped])
+        except UnflushedError as error:
+            _log.warning("topics_cut_unflushed", path=bag, reason=str(error))
         except (EpisodicError, OSError):
-            if os.path.samestat(path.lstat(), before):  # else it was cut, and then not flushed
-                EXPIRED.write(self.bag_dir, expired)
-                if receipt is not None:
-                    with suppress(OSError):
-                        SHIPPED.append(self.bag_dir, [receipt])
+            EXPIRED.write(self.bag_dir, expired)
+            if receipt is not None:
+                with suppress(OSError):
+                    SHIPPED.append(self.bag_dir, [receipt])
             raise
         return gone
 

@@ -483,7 +483,7 @@ def cut_off_after(patch: pytest.MonkeyPatch, steps: int) -> None:
     for place, name in (
         (Path, "replace"),
         (os, "link"),
-        (eraser, "flush"),
+        (repair, "flush"),
         (repair, "correct"),
         (eraser, "append_losses"),
         (ERASING, "remove"),

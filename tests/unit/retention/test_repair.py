@@ -1,3 +1,4 @@
+import errno
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -6,13 +7,15 @@ from pathlib import Path
 import pytest
 from mcap.records import McapRecord
 
+from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.retention import repair
 from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, along_x, write_mcap
-from tests.support.fakes import files_limited_to
+from tests.support.fakes import broken, files_limited_to
 from tests.support.housekeepers import files_in
 from tests.unit.storage.mcap.test_writer import contents
 
@@ -56,6 +59,19 @@ def test_on_a_full_disk_the_original_stays_and_the_next_attempt_repairs_it(path:
     assert path.read_bytes() == before
     assert files_in(path.parent) == ["a_0.mcap"]
     assert REPAIRER.repair(path) is not None
+
+
+@pytest.mark.parametrize("is_empty", [False, True])
+def test_what_was_done_is_said_where_the_folder_cannot_be_flushed(
+    path: Path, *, is_empty: bool
+) -> None:
+    if is_empty:
+        path.write_bytes(b"")
+    with broken(repair, "flush", errno.EIO):
+        outcome = recover_files(path, force=True)
+    assert (outcome.removed, outcome.repaired, outcome.failed) == (is_empty, not is_empty, 0)
+    assert path.exists() is not is_empty
+    assert "a_0.mcap was changed, and a power cut may undo that: Input/output" in outcome.lines[0]
 
 
 def write_on(path: Path) -> None:

@@ -87,17 +87,17 @@ class RecoveryOutcome:
             self.whole += 1
             return
         rewritten = repaired.rewritten
+        notes = "".join(f"; {note}" for note in repaired.notes)
         if rewritten is None:
             self.removed += 1
-            self.lines.append(f"{name}: empty, removed")
+            self.lines.append(f"{name}: empty, removed{notes}")
             return
         self.repaired += 1
         self.messages += rewritten.messages
         self.lines.append(
             f"{name}: repaired: {counted(rewritten.messages, 'message')}, "
             f"{rewritten.describe_loss()} "
-            f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now)"
-            f"{''.join(f'; {note}' for note in rewritten.notes)}"
+            f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now){notes}"
         )
 
     def summary(self) -> str:
