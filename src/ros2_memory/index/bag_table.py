@@ -26,6 +26,7 @@ from ros2_memory.index.file_state import Classification, FileNotes, FileState, S
 from ros2_memory.index.scan import BAG_DIR_SETTING, UNSEEN, ScanResult, Stamp, Tree
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.split_order import is_recording, split_of
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
@@ -379,8 +380,9 @@ class BagTable:
     def _counted_form(self, path: str, context: ScanContext) -> Classification | None:
         """Returns a file's classification; None if it has none, or if its other form counts.
 
-        While a split is being compressed, `x.mcap` and `x.mcap.zstd` are one bag, twice. If both
-        are complete and have not grown for three splits, somebody keeps both: both count.
+        While a split is being compressed, `x.mcap` and `x.mcap.zstd` are one bag, twice, and stay
+        so if the recorder is killed. If others are both complete and have not grown for three
+        splits, somebody keeps both: both count.
         """
         self._hidden.discard(path)
         classification, other = self._classified.get(path), self._classified.get(other_form(path))
@@ -390,8 +392,11 @@ class BagTable:
         is_kept = not any(notes is not None and notes.grew_lately(context) for notes in forms)
         if is_kept and classification.state is FileState.UNREAD:
             return classification
+        name = split_of(path)
+        both_count = is_kept and not (name and is_recording(name.series))
         if classification.state == other.state and (
-            (is_kept and classification.state is FileState.CLOSED) or not path.endswith(COMPRESSED)
+            (both_count and classification.state is FileState.CLOSED)
+            or not path.endswith(COMPRESSED)
         ):
             return classification
         self._hidden.add(path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from functools import cached_property
 from itertools import accumulate, chain
+from math import ceil
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -104,7 +105,14 @@ class Timeline:
             bags_beside(bag).append(bag)
         segments: list[Segment] = []
         for position, segment in enumerate(self.segments):
-            segments += _segments_of(touched[position]) if position in touched else [segment]
+            if position not in touched:
+                segments.append(segment)
+                continue
+            bags = touched[position]
+            # Else bags that come in the order of copying, or go one by one, leave many segments.
+            if segments and len(segments[-1].bags) + len(bags) <= SEGMENT_BAGS // 2:
+                bags += segments.pop().bags
+            segments += _segments_of(bags, evenly=segment is not self.segments[-1])
         return Timeline(segments)
 
     @cached_property
@@ -399,10 +407,10 @@ def _span_of_faults(bag: BagFile) -> Span:
     return start, bag.mtime_ns if bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS else bag.end
 
 
-def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
-    """Returns the segments of bags that are given in any order."""
+def _segments_of(bags: Iterable[BagFile], *, evenly: bool = False) -> list[Segment]:
+    """Returns the segments of bags that are given in any order: full ones, or of about one size."""
     ordered = sorted(bags, key=in_time)
-    return [
-        Segment(ordered[begin : begin + SEGMENT_BAGS])
-        for begin in range(0, len(ordered), SEGMENT_BAGS)
-    ]
+    size = SEGMENT_BAGS
+    if evenly and len(ordered) > size:
+        size = ceil(len(ordered) / ceil(len(ordered) / size))
+    return [Segment(ordered[begin : begin + size]) for begin in range(0, len(ordered), size)]

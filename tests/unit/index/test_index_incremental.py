@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import zstandard
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -351,3 +352,22 @@ def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dat
     os.utime(tmp_path / "rec" / dated, ns=(LONG_AGO, 10_413_792_000 * S))
     [odometry] = asked(memory_of(tmp_path, recalls=recalls), "list_recorded_topics")
     assert odometry["count"] == 20
+
+
+@pytest.mark.parametrize(("name", "bags"), [("rec_1", 1), ("sample", 2)])
+def test_a_split_that_a_kill_left_in_both_forms_counts_once(
+    tmp_path: Path, name: str, bags: int
+) -> None:
+    """The recorder was killed after it had compressed a split, before it deleted the other form."""
+    path = write_mcap(
+        tmp_path / "rec" / f"{name}.mcap", [odom(n * S, 0.1 * n, 0.0) for n in range(9)]
+    )
+    packed = path.with_name(f"{path.name}.zstd")
+    packed.write_bytes(zstandard.compress(path.read_bytes()))
+    for file in (path, packed):
+        os.utime(file, ns=(LONG_AGO, LONG_AGO))
+    memory = memory_of(tmp_path, storage="rosbag2")
+    [odometry] = asked(memory, "list_recorded_topics")
+    assert odometry["count"] == 9 * bags
+    path.unlink()
+    assert [bag.path for bag in memory.index.refresh().bags] == [packed]

@@ -95,6 +95,23 @@ def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
         _assert_holds(timeline, [pool[number] for number in present], windows)
 
 
+@pytest.mark.parametrize("arrival", ["in time", "backwards", "by name", "thinned"])
+def test_a_timeline_has_few_segments_in_whatever_order_bags_come_and_go(
+    arrival: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each segment costs a question some time: bags copied backwards had one each."""
+    monkeypatch.setattr(timelines, "SEGMENT_BAGS", 16)
+    bags = [odom_bag(f"/b/rec/rec_{n}.mcap", n * 10 * S, n * 10 * S + 9 * S) for n in range(320)]
+    timeline = Timeline.of(bags if arrival == "thinned" else [])
+    ways = {"backwards": bags[::-1], "by name": sorted(bags, key=lambda bag: bag.file)}
+    for nth, bag in enumerate(ways.get(arrival, bags)):
+        if arrival != "thinned":
+            timeline = timeline.changed((), [bag])
+        elif nth % 16:
+            timeline = timeline.changed([bag], ())
+    assert len(timeline.segments) <= (len(timeline.bags) // 8 or 1) + 3
+
+
 def _random_bag(chance: Random, number: int) -> BagFile:
     start = chance.randrange(3000)
     long = chance.random() < 0.05
