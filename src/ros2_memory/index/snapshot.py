@@ -249,18 +249,17 @@ class Snapshot:
         pauses: list[Pause] = []
         newest: BagFile | None = None
         for segment in self._dated_segments:
-            if newest is None:
-                pauses += segment.pauses
-            else:
+            between = segment.pauses
+            if newest is not None:
                 # A bag of an earlier segment may last into this one.
-                reach = newest.end
-                if segment.bags[0].start - reach > SHORTEST_PAUSE_NS:
-                    pauses.append(pause_between(newest, segment.bags[0]))
-                pauses += (
-                    pause._replace(start=max(pause.start, reach))
-                    for pause in segment.pauses
-                    if pause.end - reach > SHORTEST_PAUSE_NS
+                between = (
+                    pause_between(newest, segment.bags[0]),
+                    *(
+                        pause_between(newest, pause.bags[1]) if pause.start < newest.end else pause
+                        for pause in between
+                    ),
                 )
+            pauses += (pause for pause in between if pause.length > SHORTEST_PAUSE_NS)
             for pause in segment.pauses_within:
                 pauses += self._parts_shared_by_all(pause)
             if newest is None or segment.latest > newest.end:

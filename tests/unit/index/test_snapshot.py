@@ -95,6 +95,20 @@ def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
         _assert_holds(timeline, [pool[number] for number in present], windows)
 
 
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_a_gap_behind_a_long_bag_is_found_wherever_segments_are_cut(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timelines, "SEGMENT_BAGS", size)
+    bags = [
+        odom_bag("/b/one/one_0.mcap", 0, 9 * S, count=91),
+        odom_bag("/b/long/long_0.mcap", 9 * S, 100 * S, count=911),
+        odom_bag("/b/rec/rec_0.mcap", 10 * S, 50 * S, count=401),
+        odom_bag("/b/rec/rec_1.mcap", 110 * S, 150 * S, count=401),
+    ]
+    assert Snapshot(Timeline.of(bags)).gaps == [(100 * S, 110 * S)]
+
+
 @pytest.mark.parametrize("arrival", ["in time", "backwards", "by name", "thinned"])
 def test_a_timeline_has_few_segments_in_whatever_order_bags_come_and_go(
     arrival: str, monkeypatch: pytest.MonkeyPatch
