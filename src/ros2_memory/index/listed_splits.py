@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -108,6 +108,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
     if not snapshot.metadata_folders:
         return []
     own, deletions, present = OwnRecordings(bag_dir), read_deleted(bag_dir), _tallies(snapshot)
+    empty = Counter(str(path.parent) for path in snapshot.empty)
     absent: list[Absent] = []
     for folder, listing in _folder_listings(snapshot, bag_dir, known):
         if listing is None or listing.bags is None:
@@ -117,7 +118,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
         is_own = bool(listing.first) and _may_be_own(own, Path(folder))
         deletion = deletions.get(folder.removeprefix(f"{bag_dir}/"))
         deleted = frozenset[str]() if deletion is None else frozenset(deletion.files)
-        lack = _compare(folder, listing, present[folder], deleted, is_own=is_own)
+        lack = _compare(folder, listing, present[folder], empty[folder], deleted, is_own=is_own)
         if lack.files or lack.messages:
             absent.append(lack)
     return absent
@@ -174,18 +175,25 @@ def _may_be_own(own: OwnRecordings, folder: Path) -> bool:
 
 
 def _compare(
-    folder: str, listing: _FolderListing, present: Tally, deleted: Collection[str], *, is_own: bool
+    folder: str,
+    listing: _FolderListing,
+    present: Tally,
+    empty: int,
+    deleted: Collection[str],
+    *,
+    is_own: bool,
 ) -> Absent:
     """Returns what a folder lists and its bags do not hold.
 
-    `present` counts its bags and their messages, `deleted` names the files that retention deleted.
+    `present` counts its bags and their messages, `empty` its closed bags without a message;
+    `deleted` names the files that retention deleted.
     """
     expected = listing.later if is_own else (*listing.first, *listing.later)
     missing = [(name, count) for name, count in expected if name not in deleted]
     lost = sum(count for _, count in missing)
     # A bag that is damaged, or cut by a handover, holds fewer messages than are listed. A total
     # also counts the files that were deleted.
-    is_comparable = present.bags == listing.bags
+    is_comparable = 0 <= (listing.bags or 0) - present.bags <= empty
     if listing.is_total and (is_own or deleted):
         is_comparable = False
     if listing.messages is not None and is_comparable:

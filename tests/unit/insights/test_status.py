@@ -370,6 +370,11 @@ def test_a_file_without_an_end_may_be_being_written_or_left_by_a_crash(tmp_path:
             "other.json",
             "metadata.yaml of rec lists 250 messages that no file here contains",
         ),
+        (
+            [("rec_0.mcap", 5), ("rec_1.mcap", 5), ("empty.mcap", 7)],  # without its journal, say
+            "other.json",
+            "metadata.yaml of rec lists 7 messages that no file here contains",
+        ),
         ([("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5)], "other.json", SOUND),  # compressed
         ([("rec_0.mcap", 9), ("rec_1.mcap", 9)], "handover.json", SOUND),  # cut by a handover
     ],
@@ -378,6 +383,7 @@ def test_splits_and_messages_that_metadata_lists_and_no_file_has_are_counted(
     tmp_path: Path, listed: list[tuple[str, int]], beside: str, doubts: str
 ) -> None:
     recording(tmp_path / "rec", *listed)
+    write_mcap(tmp_path / "rec" / "empty.mcap", [])
     (tmp_path / "rec" / beside).write_text("{}")
     assert shown(memory_of(tmp_path))["doubts"].endswith(doubts)
 
