@@ -117,6 +117,9 @@ class _ThreadLocal(threading.local):
 _THREAD: Final = _ThreadLocal()
 
 
+_TOO_MUCH: Final = "damaged: compressed data is larger than stated, or than it can be"
+
+
 def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
     """Decompresses one zstd frame.
 
@@ -125,17 +128,18 @@ def decompress_zstd(compressed: bytes | memoryview, limit: SizeLimit) -> bytes:
             decompress to.
     """
     stated = zstandard.frame_content_size(compressed)  # negative where the frame does not state it
-    limit.require("compressed data", stated)
     # zstandard allocates the stated size, so it must be possible: no block takes fewer bytes, or
     # decompresses to more (RFC 8878, 3.1.1.2).
-    if stated > (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
-        raise UnreadableError("damaged: compressed data states more than it can hold")
+    most = (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES
+    if stated > min(most, limit.max_bytes):
+        raise UnreadableError(_TOO_MUCH)
     if stated >= 0:
         if stated > LARGE_BYTES:
             limit.take_turn()
         return _THREAD.decompressor.decompress(compressed)
     data = decompress_front(partial(zstd_front, compressed), limit)
-    limit.require("compressed data", len(data))
+    if len(data) > limit.max_bytes:
+        raise UnreadableError(_TOO_MUCH)
     return data
 
 

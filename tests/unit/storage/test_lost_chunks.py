@@ -2,9 +2,11 @@
 
 import errno
 import sqlite3
+import struct
 import tempfile
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, Writer
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
@@ -33,7 +35,14 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, boolean, definition, odom, text, write_mcap
 from tests.support.examples import examples
-from tests.support.mcap_surgery import SMALL, chatter, chunks_of, damaged, spoil_chunk
+from tests.support.mcap_surgery import (
+    SMALL,
+    chatter,
+    chunks_of,
+    damaged,
+    raw_mcap,
+    spoil_chunk,
+)
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.reader_cases import read_through
 
@@ -66,6 +75,29 @@ def test_reading_goes_on_behind_a_damaged_chunk(
     assert error.lost == (lost.message_start_time, lost.message_end_time)
     whole = [*range(lost.message_start_time), *range(lost.message_end_time + 1, 40)]
     assert [each.log_time for each in found] == sorted(whole, reverse=newest_first)
+
+
+@pytest.mark.parametrize("compression", CompressionType)
+def test_a_chunk_without_a_checksum_that_ends_early_is_reported(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/chatter", "cdr", schema)
+        for each in chatter(40):
+            writer.add_message(channel, each.log_time, each.payload, each.log_time)
+
+    how = partial(raw_mcap, enable_crcs=False, use_statistics=False)
+    path = how(tmp_path / "a.mcap", fill, compression=compression)
+    assert McapReader().summarize(path).schema.notes == ()
+    [chunk] = chunks_of(path)
+    data, cut = bytearray(path.read_bytes()), chunk.compressed_size // 2
+    begin, end = chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
+    for at in (begin + 1, end - chunk.compressed_size - 8):
+        struct.pack_into("<Q", data, at, struct.unpack_from("<Q", data, at)[0] - cut)
+    del data[end - cut : end]
+    path.write_bytes(data)
+    assert "left out: 1 damaged record" in McapReader().summarize(path).schema.notes[-1]
 
 
 def overlapping(folder: Path) -> Memory:

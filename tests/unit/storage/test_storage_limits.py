@@ -75,8 +75,8 @@ def string_chunk(*more: Piece) -> Piece:
 
 
 def bomb(size: int) -> Piece:
-    """A chunk of some bytes that unpacks to `size` bytes, which make no record."""
-    return chunk_of(b"", "zstd", packed=rle_frame(size), size=10, crc=0)
+    """A chunk of some bytes that unpacks to `size` bytes, which do not match its checksum."""
+    return chunk_of(b"", "zstd", packed=rle_frame(size), size=size, crc=1)
 
 
 @contextmanager
@@ -102,15 +102,15 @@ def bag(folder: Path, *records: Piece) -> Path:
     ("records", "said"),
     [
         *(
-            (
-                [string_chunk(), chunk_of(b"", how, packed=packed, size=stated, crc=0)],
-                "larger than the 1 MiB allowed; if that is right, raise reader.max_chunk_mb",
-            )
+            ([string_chunk(), chunk_of(b"", how, packed=packed, size=stated, crc=0)], said)
             for how, packed in (
                 ("zstd", rle_frame(300 * MB)),
                 ("lz4", lz4.frame.compress(bytes(300 * MB))),
             )
-            for stated in (10, 1 << 40)
+            for stated, said in (
+                (10, "left out: 1 damaged record ("),
+                (1 << 40, "than the 1 MiB allowed; if that is right, raise reader.max_chunk_mb"),
+            )
         ),
         # Outside of chunks.
         ([*STRINGS, string_message("x" * 2 * MB), string_message()], "a message is larger"),

@@ -323,8 +323,12 @@ def walk_chunk(data: bytes) -> ChunkContent:
 
 
 class ChunkHead(NamedTuple):
-    """The fields of a chunk record before its data, which begins at `data_at` in the body."""
+    """The fields of a chunk record before its data, which begins at `data_at` in the body.
 
+    `size` is that of the decompressed data.
+    """
+
+    size: int
     crc: int
     compression: str
     data_size: int
@@ -351,26 +355,28 @@ def chunk_head(body: bytes) -> ChunkHead:
         ValueError: the name of the compression is not UTF-8.
     """
     try:
-        *_, crc, name_size = CHUNK.unpack_from(body)
+        _, _, size, crc, name_size = CHUNK.unpack_from(body)
         name_end = CHUNK.size + name_size
         (data_size,) = UINT64.unpack_from(body, name_end)
     except struct.error as error:
         raise UnreadableError("damaged: a chunk ends inside its own header") from error
-    return ChunkHead(crc, body[CHUNK.size : name_end].decode(), data_size, name_end + UINT64.size)
+    compression = body[CHUNK.size : name_end].decode()
+    return ChunkHead(size, crc, compression, data_size, name_end + UINT64.size)
 
 
 def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) -> bytes:
-    """Decompresses the body of a chunk record, and verifies its checksum if it has one.
+    """Decompresses the body of a chunk record; verifies its size, and its checksum if it has one.
 
     Of a body that is not `is_whole`, the front is decompressed, as far as it is there. Nothing is
-    allocated by the size that the chunk states.
+    allocated by the size that the chunk states, and no more is decompressed.
 
     Raises:
         UnreadableError: it is damaged, larger than allowed, or its compression is unknown.
     """
     head = chunk_head(body)
     compressed = memoryview(body)[head.data_at : head.data_at + head.data_size]
-    limit.require("a chunk", head.data_size)
+    limit.require("a chunk", max(head.size, head.data_size))
+    limit = limit._replace(max_bytes=head.size)
     if not is_whole:
         if head.compression == "zstd":
             data = decompress_front(partial(zstd_front, compressed), limit)
@@ -380,7 +386,8 @@ def decompressed_chunk(body: bytes, limit: SizeLimit, *, is_whole: bool = True) 
     if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
     data = _decompress(head.compression, compressed, limit)
-    limit.require("a chunk", len(data))
+    if len(data) != head.size:  # data that ends early decompresses without an error
+        raise UnreadableError("damaged: a chunk is not as long as it states")
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data
@@ -459,8 +466,9 @@ class ChunkOpener:
         with as_unreadable():
             body = chunk_body(self._file, record.offset, in_file, self._limit)
             is_whole = record.end <= self._file.size
+            # Also of a chunk that turns out to be damaged.
+            self._bytes += min(chunk_head(body).size, self._limit.max_bytes)
             data = decompressed_chunk(body, self._limit, is_whole=is_whole)
-            self._bytes += len(data)
             content = walk_chunk(data)
         self._bytes += MESSAGE_BYTES * content.message_count
         self._chunks += 1
