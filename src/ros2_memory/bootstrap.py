@@ -476,7 +476,11 @@ def shared_parts(settings: Settings) -> SharedParts:
 
 
 def build_memory(
-    settings: Settings, shared: SharedParts | None = None, *, setting: str | None = None
+    settings: Settings,
+    shared: SharedParts | None = None,
+    *,
+    setting: str | None = None,
+    hidden: tuple[str, ...] = (),
 ) -> Memory:
     """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
@@ -484,6 +488,7 @@ def build_memory(
         settings: the configuration.
         shared: the parts that it shares with other memories; None for parts of its own.
         setting: the setting in which the user named the bags; None for `recording.bag_dir`.
+        hidden: how topics begin that are left out.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
@@ -497,8 +502,8 @@ def build_memory(
     clock = WallClock()
     shared = shared or shared_parts(settings)
     bag_dir = settings.recording.bag_dir
-    reader = BagDirReader(shared.reader, bag_dir)
-    columns = build_columns(settings, reader)
+    reader = BagDirReader(shared.reader, bag_dir, hidden=hidden)
+    columns = build_columns(settings, reader, f"{bag_dir.absolute()} {hidden}" if hidden else None)
     index = IndexManager(
         bag_dir,
         reader,
@@ -519,15 +524,15 @@ def build_memory(
 
 
 def build_columns(
-    settings: Settings, reader: BagReader, of_lake: str | None = None
+    settings: Settings, reader: BagReader, apart: str | None = None
 ) -> ColumnStore | None:
     """Returns the store of columns; None if the configuration wants none.
 
     Args:
         settings: the configuration.
         reader: leaves out what the bag directory hides: overlaps, and what `forget` deletes.
-        of_lake: the name of a robot in a lake. Its store is in the cache folder, and can be made
-            again from the lake.
+        apart: what identifies bags that are not those of the bag directory as they are. Their
+            store is in the cache folder.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
@@ -535,8 +540,8 @@ def build_columns(
     if not settings.store.enabled:
         return None
     definitions = _hash_of(_definitions_of(settings))
-    if of_lake is not None:
-        cached = _cached(f"{settings.lake.warehouse} {of_lake}".encode())
+    if apart is not None:
+        cached = _cached(os.fsencode(apart))
         return ColumnStore(cached, reader.definition, definitions=definitions)
     bag_dir = settings.recording.bag_dir
     return ColumnStore(

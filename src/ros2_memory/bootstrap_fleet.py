@@ -170,7 +170,9 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     if not settings.fleet.shared_map and own.data.places_file == settings.data.places_file:
         # The robot has a map of its own, and `data.places_file` is about another one.
         limits = replace(limits, places=(), places_file="")
-    memory = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
+    hidden = hidden_topics(settings, name)
+    memory = build_memory(own, shared, setting=ROBOTS_SETTING, hidden=hidden)
+    memory = replace(memory, limits=limits)
     if lake is None:
         return Robot(name, memory)
     shipped = _shipped(memory, lake, own, name, shared)
@@ -187,7 +189,7 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
 
     index = LakeIndex(lake, name, memory.bag_dir, memory.clock)
     reader = LakeReader(index, memory.reader, shared.large)
-    store = build_columns(own, shared.reader, name)
+    store = build_columns(own, shared.reader, f"{own.lake.warehouse} {name}")
     reading = reading_of(own, shared.extractor.schemas)
     scanner = Scanner(store, index.bag_dir, reading, shared.large, shared.caches)
     return replace(memory, index=index, reader=reader, scanner=scanner, memo=Memo())
@@ -213,6 +215,16 @@ def robot_settings(settings: Settings, name: str) -> Settings:
     )
 
 
+def hidden_topics(settings: Settings, name: str) -> tuple[str, ...]:
+    """Returns how topics begin that belong to other robots in the same bags: with their names."""
+    robots = settings.fleet.robots
+    return tuple(
+        f"/{other}/"
+        for other, bag_dir in robots.items()
+        if other != name and bag_dir == robots.get(name)
+    )
+
+
 def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
     """Returns the robots of `fleet.robots` as they are shipped, all with `shared`.
 
@@ -231,7 +243,8 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
     robots: list[RobotBags] = []
     for name in settings.fleet.robots:
         own = robot_settings(settings, name)
-        memory = build_memory(own, shared, setting=ROBOTS_SETTING)
+        hidden = hidden_topics(settings, name)
+        memory = build_memory(own, shared, setting=ROBOTS_SETTING, hidden=hidden)
         filling = build_backfill(own, memory).filling
         reading = reading_of(own, shared.extractor.schemas)
         robots.append(

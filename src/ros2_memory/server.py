@@ -226,7 +226,7 @@ def _parts_of_fleet(
 ) -> _Parts:
     """Returns the parts of a fleet's server. It has no page, which shows one robot."""
     from ros2_memory.bootstrap import build_backfill, build_server
-    from ros2_memory.bootstrap_fleet import robot_settings
+    from ros2_memory.bootstrap_fleet import hidden_topics, robot_settings
     from ros2_memory.serving.backfill import keep_all_backfilled
     from ros2_memory.serving.health import FleetHealth, Health
 
@@ -234,7 +234,8 @@ def _parts_of_fleet(
     def backfill_of(name: str) -> Backfill:
         robot = fleet.robots[name]
         backfill = build_backfill(robot_settings(settings, name), robot.memory)
-        if not robot.in_lake:  # the helper reads bags of a bag directory, not of a lake
+        # The helper reads all of the bags in a bag directory, and no lake.
+        if not (robot.in_lake or hidden_topics(settings, name)):
             options = "--bag-dir", str(robot.memory.bag_dir.absolute())
             backfill.helper = _helper_command(overrides, *options)
         return backfill

@@ -1,4 +1,4 @@
-"""Reads the bags of one bag directory through another `BagReader`, with three rules added.
+"""Reads the bags of one bag directory through another `BagReader`, with four rules added.
 
 - It stays inside the directory. Seconds pass between a scan and a query, in which somebody may
   replace a folder by a link. `O_NOFOLLOW` protects the last part of a path; this reader checks the
@@ -6,6 +6,7 @@
 - It leaves out messages that count in another recording, by `handover.json`.
 - If retention deleted the path that the index knows, it reads the bag under another hard link, in a
   saved moment.
+- It leaves out topics of other robots that are in the same bags.
 """
 
 from __future__ import annotations
@@ -67,12 +68,14 @@ class BagDirReader(BagReader):
         reader: the adapter, which decodes messages.
         bag_dir: the directory that paths must lie in, which may be a link; None allows any path.
         every_message: ignores `handover.json`, so that counts are those of the files.
+        hidden: how topics begin that are in no summary and no list of channels.
     """
 
     reader: BagReader
     bag_dir: Path | None = None
     _: KW_ONLY
     every_message: bool = False
+    hidden: tuple[str, ...] = ()
 
     def reads(self, path: Path) -> bool:
         """Returns what the adapter returns."""
@@ -93,6 +96,9 @@ class BagDirReader(BagReader):
             BagError: see the adapter; or the path leads out of the bag directory.
         """
         summary = self.reader.summarize(self._confined(path))
+        if self.hidden:
+            shown = (each for each in summary.topics if not each.topic.startswith(self.hidden))
+            summary = summary.with_topics([*shown])
         handover, problem = self._sidecar_of(path)
         if problem is not None:
             summary = summary.with_notes((*summary.notes, problem))
@@ -158,8 +164,9 @@ class BagDirReader(BagReader):
         return chain.from_iterable(opened())
 
     def channels(self, path: Path) -> Sequence[Channel]:
-        """Returns every channel that the file declares."""
-        return self.reader.channels(self._located(path))
+        """Returns every channel that the file declares, but those of hidden topics."""
+        channels = self.reader.channels(self._located(path))
+        return [channel for channel in channels if not channel.topic.startswith(self.hidden)]
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns what the adapter returns."""

@@ -252,6 +252,7 @@ def open_memory(
     verbose: bool,
     allows_fleet: bool = False,
     setting: str | None = None,
+    hidden: tuple[str, ...] = (),
 ) -> "Memory":
     """Opens the memory of the configured bags, and indexes the directory as it is now.
 
@@ -261,6 +262,7 @@ def open_memory(
         allows_fleet: whether the command also asks the robots of a fleet, whose memory has no bags
             of its own, and no index.
         setting: the setting that names the bags, if it is not `recording.bag_dir`.
+        hidden: how topics begin that are left out.
 
     Raises:
         ConfigError: an adapter cannot be built.
@@ -277,7 +279,7 @@ def open_memory(
     from ros2_memory.bootstrap import build_memory, shared_parts  # noqa: PLC0415
 
     configure_logging(settings.logging.level if verbose else "error", settings.logging.format)
-    memory = build_memory(settings, shared_parts(settings), setting=setting)
+    memory = build_memory(settings, shared_parts(settings), setting=setting, hidden=hidden)
     if robots:
         return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):
@@ -298,10 +300,10 @@ def open_robot(settings: Settings, name: str, *, verbose: bool) -> "tuple[Settin
     """
     if not name:
         return settings, open_memory(settings, verbose=verbose)
-    from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings  # noqa: PLC0415 - as above
+    from ros2_memory import bootstrap_fleet as fleet  # noqa: PLC0415 - as above
 
-    own = robot_settings(settings, name)
-    return own, open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
+    own, hidden = fleet.robot_settings(settings, name), fleet.hidden_topics(settings, name)
+    return own, open_memory(own, verbose=verbose, setting=fleet.ROBOTS_SETTING, hidden=hidden)
 
 
 def present_time(memory: "Memory") -> Ns:
