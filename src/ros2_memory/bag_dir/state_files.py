@@ -119,7 +119,7 @@ class Loss:
             their header stamps (then they may never have been published). `rosbag2`: its own count.
             `refused`: the QoS or the type of a publisher did not fit. `forgotten`, `expired`: a
             request or `retention.topics` deleted them. Or a key of `INTERRUPTIONS`: the time from
-            when the recording last grew to when that was noticed, or of the pause.
+            when the recording last grew to when recording went on, or of the pause.
     """
 
     topic: str

@@ -281,14 +281,17 @@ def _split_by_cause(
     longer one bags were recorded, so the clock was set in it.
     """
     first, last = gap
-    unexplained = [gap]
+    explained = defaultdict[str, Spans](list)
     for loss in interruptions:
         has_an_end = first - _RESTART_NS <= loss.start or loss.stop <= last + _RESTART_NS
         if loss.start < last and first < loss.stop and has_an_end:
-            rest = without(unexplained, [(loss.start - margin, loss.stop + margin)])
-            for start, end in without(unexplained, rest):
-                yield loss.by, start, end
-            unexplained = rest
+            explained[loss.by].append((loss.start - margin, loss.stop + margin))
+    unexplained = [gap]
+    for cause, spans in explained.items():
+        rest = without(unexplained, united(spans))
+        for start, end in without(unexplained, rest):
+            yield cause, start, end
+        unexplained = rest
     for start, end in unexplained:
         yield "", start, end
 

@@ -118,13 +118,12 @@ class Housekeeping:
         """
         heartbeat, now = read_heartbeat(self.bag_dir).heartbeat, self.clock.now()
         if heartbeat is not None and heartbeat.state is not RecorderState.STOPPED:
-            last_alive = min(heartbeat.updated, now)
+            recorded = heartbeat.state not in {RecorderState.STARTING, RecorderState.PAUSED}
+            first = min(heartbeat.updated if recorded else heartbeat.since, now)
             if self.triggers is not None:
-                self.triggers.note_restart(last_alive, now)
-            if heartbeat.state is RecorderState.RECORDING:
-                self._note_interruption(last_alive, now, "unclean")
-            elif heartbeat.state is RecorderState.PAUSED:
-                self._note_interruption(min(heartbeat.since, now), now, "paused")
+                self.triggers.note_restart(first, now)
+            is_paused = heartbeat.state is RecorderState.PAUSED
+            self._note_interruption(first, now, "paused" if is_paused else "unclean")
         if self._limits.keeps_foreign:
             for directory in filter(is_folder, self.bag_dir.iterdir()):
                 # A kill came before its directory was listed: nothing shows whose it is.
@@ -201,9 +200,10 @@ class Housekeeping:
             how: a key of `INTERRUPTIONS`.
         """
         now = self.clock.now()
+        first = min(first, now)
         if self.triggers is not None and how != "paused":
-            self.triggers.note_restart(now, now)
-        self._note_interruption(min(first, now), now, how)
+            self.triggers.note_restart(first, now)
+        self._note_interruption(first, now, how)
 
     def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
         with self._lock:

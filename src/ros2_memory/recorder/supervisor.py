@@ -111,8 +111,8 @@ class Supervisor:
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
-        self._interruptions: list[tuple[Ns, Interruption]] = []
-        self._paused_at: Ns | None = None  # since when nothing is recorded, by the wall clock
+        # Since when nothing is recorded, by the wall clock; written down when that is over.
+        self._interruptions: dict[Interruption, Ns] = {}
         self.stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
@@ -132,7 +132,7 @@ class Supervisor:
             _Task("rotation", self._check_rotation),
             _Task("restart", self._check_restart, needs_disk=True),
             _Task("topics", self._topic_watch.look, TOPICS_S),
-            _Task("interruptions", self._report_interruptions, needs_disk=True),
+            _Task("interruptions", self._end_interruptions, needs_disk=True),
             _Task("recorded", self._note_recorded),
             _Task("settle", lambda _: self._sessions.recover(), UNSETTLED_S, needs_disk=True),
             _Task("faults", lambda _: self._events.report_faults(background.faults())),
@@ -196,9 +196,7 @@ class Supervisor:
         self._reception.flush()
         self._paused = False
         if not self._disk.away:
-            if self._paused_at is not None:
-                self.housekeeper.note_restart(self._paused_at, "paused")
-                self._paused_at = None
+            self._report_interruptions()
             self.housekeeper.finish()
             # Splits that were held back are compared only now.
             self._sessions.settle_handovers()
@@ -290,7 +288,7 @@ class Supervisor:
 
     def _end_for_now(self, now: ClockReading) -> None:
         self._sessions.end_all(now)
-        self._paused_at = now.wall if self._paused_at is None else self._paused_at
+        self._interruptions.setdefault("paused", now.wall)
 
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
@@ -322,7 +320,7 @@ class Supervisor:
         if is_silent:
             sentence = (
                 f"{current.name} does not grow: the robot is silent, or its messages do not "
-                "arrive; the recording is closed"
+                "arrive or not reach the disk; a new recording is to close it"
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = is_silent and not is_over
@@ -369,9 +367,6 @@ class Supervisor:
         except RecorderError as error:
             self._events.fail("recorder_not_started", str(error))
             raise
-        if self._paused_at is not None:
-            self._add_interruption(self._paused_at, "paused")
-            self._paused_at = None
         self._topic_watch.note_begin(now)
         self._silence.note_begin(now.monotonic_s)
 
@@ -400,11 +395,16 @@ class Supervisor:
     def _add_interruption(self, first: Ns, how: Interruption) -> None:
         # No recording follows one that hangs when all are ended.
         if not self.stopped:
-            self._interruptions.append((first, how))
+            self._interruptions.setdefault(how, first)
 
-    def _report_interruptions(self, _: ClockReading) -> None:
-        while self._interruptions:
-            self.housekeeper.note_restart(*self._interruptions.pop(0))
+    def _end_interruptions(self, _: ClockReading) -> None:
+        if self.is_recording:
+            self._report_interruptions()
+
+    def _report_interruptions(self) -> None:
+        for how, first in self._interruptions.items():
+            self.housekeeper.note_restart(first, how)
+        self._interruptions.clear()
 
     def _write_heartbeat(
         self,

@@ -734,6 +734,15 @@ def test_a_cause_is_said_of_the_interruption_and_not_of_the_whole_gap(apart: Pat
     assert "60 s" not in doubts
 
 
+def test_a_gap_in_which_recorders_died_again_and_again_is_one(apart: Path) -> None:
+    for second in (22, 40, 57, 75):
+        interrupted(apart, second, second + 1)
+    assert causes(apart) == [
+        f"nothing was recorded from 020.000000 to 086.000000 (66 s), {DIED}",
+        "nothing was recorded from 086.000000 to 100.000000 (14 s)",
+    ]
+
+
 def test_a_restart_across_which_the_clock_was_set_is_the_cause_of_no_gap_between_its_dates(
     apart: Path,
 ) -> None:

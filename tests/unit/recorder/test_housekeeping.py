@@ -320,6 +320,8 @@ def test_a_removal_takes_no_other_file_than_the_one_looked_at_and_follows_no_lin
     ("state", "found"),
     [
         (RecorderState.RECORDING, [("unclean", 60)]),
+        (RecorderState.STOPPING, [("unclean", 60)]),
+        (RecorderState.STARTING, [("unclean", 10)]),
         (RecorderState.PAUSED, [("paused", 10)]),
         (RecorderState.STOPPED, []),
     ],
