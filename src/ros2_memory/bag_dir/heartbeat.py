@@ -62,7 +62,7 @@ class Heartbeat:
         recordings: the directories that are being written, relative to the bag directory with
             forward slashes; two during a rotation.
         unknown_types: topics that are offered and not recorded, since `ros2 bag record` does not
-            know their type; one topic of each such type.
+            know their type, or knows several; one topic of each type that it does not know.
         lost: the number of messages of each topic that are known to be missing in the last hour;
             topics need a counter or a regular header stamp for it.
     """

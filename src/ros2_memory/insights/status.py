@@ -241,7 +241,8 @@ def required_missing(heartbeat: Heartbeat) -> Iterator[str]:
 def unrecorded(heartbeat: Heartbeat) -> Iterator[str]:
     """Yields a sentence for each reason why offered topics are not recorded."""
     if unknown := heartbeat.unknown_types:
-        yield f"not recorded, since ros2 bag record does not know the type: {listed(unknown)}"
+        why = "ros2 bag record does not know the type, or knows several"
+        yield f"not recorded, since {why}: {listed(unknown)}"
     if heartbeat.unheard:
         advice = f"; {heartbeat.advice}" if heartbeat.advice else ""
         yield f"offered for 30 s, and no message has come: {listed(heartbeat.unheard)}{advice}"

@@ -23,7 +23,7 @@ _ADVICE = {
         "the topic is not recorded, nor are others of its type, which ros2 bag record does not "
         "name: name the workspace that defines the type in recorder.setup_files"
     ),
-    LineKind.SEVERAL_TYPES: "the topic is not recorded: publishers disagree on its type",
+    LineKind.SEVERAL_TYPES: "publishers disagree on its type: at most one type is recorded",
     LineKind.TOPIC_LOST: "messages were lost: the disk is too slow for what is recorded",
     LineKind.MESSAGES_LOST: "messages were lost: the disk is too slow for what is recorded",
 }

@@ -250,9 +250,12 @@ class Reception:
         for path in paths:
             self._measure("", path)
 
-    def learn(self, recording: str, path: Path) -> None:
-        """Measures a closed split of a recording in the background."""
-        self.background.add(_TASK, lambda: self._measure(recording, path))
+    def learn(self, recording: str, path: Path, unreceived: Collection[str] = ()) -> None:
+        """Measures a closed split of a recording in the background.
+
+        `unreceived`: topics of which some publisher was not received meanwhile, for its type.
+        """
+        self.background.add(_TASK, lambda: self._measure(recording, path, unreceived))
 
     def flush(self) -> None:
         """Counts the losses that only a further split could disprove: recording has ended."""
@@ -331,11 +334,6 @@ class Reception:
             before = self._asked_anew.get(topic)
             was_best_effort = before is not None and before.best_effort
             self._asked_anew[topic] = _Anew(best_effort or was_best_effort)
-        self.note_unreceived(recording, topic)
-
-    def note_unreceived(self, recording: str, topic: str) -> None:
-        """Notes that a recording receives no message of some publisher of a topic."""
-        with self._lock:
             state = self._recordings.get(recording)
             if state is not None:
                 state.refused.add(topic)
@@ -390,7 +388,7 @@ class Reception:
     def _plan_queues(self) -> QueuePlan:
         return plan_queues(self._flows_with_depth(), self.queue_bytes)
 
-    def _measure(self, recording: str, path: Path) -> None:
+    def _measure(self, recording: str, path: Path, unreceived: Collection[str] = ()) -> None:
         """Measures a split; without a recording it is of an earlier run."""
         try:
             split = measure_split(self.reader, path, end_only=not recording)
@@ -404,11 +402,12 @@ class Reception:
         with self._lock:
             before = self._plan_queues().cut_short
             state = self._recordings.get(recording)
-            self._add_flows(split, frozenset() if state is None else state.refused)
+            refused = {*unreceived} if state is None else state.refused.union(unreceived)
+            self._add_flows(split, refused)
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())
             if state is not None and split.arrivals:
-                self._note_split(state, split.start, split.end)
+                self._note_split(state, refused, split.start, split.end)
             if recording:
                 self._arrivals.add_split(split)
                 losses = self._losses.add_split(recording, split.progress)
@@ -430,7 +429,9 @@ class Reception:
                 if not flow.offered.reliable:
                     self._asked_anew[topic] = _Anew(best_effort=True)
 
-    def _note_split(self, recording: _Recording, start: Ns, end: Ns) -> None:
+    def _note_split(
+        self, recording: _Recording, refused: Collection[str], start: Ns, end: Ns
+    ) -> None:
         """Notes the time of a split, which is lost to each topic with a refused publisher."""
         since = first = start
         if recording.span is not None:
@@ -438,7 +439,7 @@ class Reception:
             first, last = recording.span
             first = min(first, start)  # the clock was set back
             since = max(first, min(last, start) - _UNNOTICED_NS)
-        for topic in sorted(recording.refused):
+        for topic in sorted(refused):
             self._unwritten.append(Loss(topic, since, end + 1, 0, "refused"))
         recording.span, recording.newest = (first, end), (since, end)
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.process.topics import TopicsFile
+    from ros2_memory.recorder.process.topics import TopicSelection, TopicsFile
     from ros2_memory.recorder.reception import Reception
     from ros2_memory.storage.base import BagReader
 
@@ -213,6 +213,8 @@ class RecordingSession:
         grew_at: when the splits last grew (wall time).
         subscribed: topics that the child has subscribed to, whether it receives them or not.
         of_unknown_type: topics of an unknown type, as the child reports them: one of each type.
+        of_several_types: topics whose publishers disagree on the type, and when the child last
+            reported that, by the monotonic clock: it does so ten times a second.
     """
 
     name: str
@@ -228,6 +230,7 @@ class RecordingSession:
         self.grew_at = self.began.wall
         self.subscribed: set[str] = set()
         self.of_unknown_type: set[str] = set()
+        self.of_several_types: dict[str, float] = {}
         self._reported = defaultdict[LineKind, set[tuple[str | None, str]]](set)
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
         self._lost, self._lost_before = Counter[str](), Counter[str]()
@@ -252,7 +255,7 @@ class RecordingSession:
             self.state = SessionState.ENDING
             self.child.end()
 
-    def new_lines(self) -> Sequence[Line]:
+    def new_lines(self, now: ClockReading, listed: TopicSelection) -> Sequence[Line]:
         """Returns the lines since the last call that are worth reporting, each warning once.
 
         Some recorders repeat a warning ten times a second.
@@ -262,30 +265,52 @@ class RecordingSession:
             line = parse_line(raw)
             if line.text and line.topic is None and "[INFO]" not in raw:
                 self._last_lines.append(line.text)
-            if line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                # The child counts from the beginning of the recording.
-                self._lost[line.topic] = line.count or 0
-            if line.kind is LineKind.READY:
-                if not self.has_recorded:
-                    lines.append(line)
+            if self._note(line, now, listed):
+                lines.append(line)
+        return lines
+
+    def _note(self, line: Line, now: ClockReading, listed: TopicSelection) -> bool:
+        """Notes what a line says; returns whether it is worth reporting."""
+        topic = line.topic or ""
+        match line.kind:
+            case LineKind.OTHER:
+                return False
+            case LineKind.READY:
+                was_recording = self.has_recorded
                 self._note_recording()
-            elif line.kind is LineKind.SUBSCRIBED and line.topic is not None:
+                return not was_recording
+            case LineKind.SUBSCRIBED:
                 # Distributions report in different words that they record; all report this.
                 self._note_recording()
                 # A recorder's own topic does not show that it hears the robot.
-                if line.topic != MESSAGES_LOST:
-                    self.subscribed.add(line.topic)
-                    lines.append(line)
-            elif line.kind is not LineKind.OTHER and self._is_new(line):
-                if line.kind is LineKind.UNKNOWN_TYPE and line.topic is not None:
-                    self.of_unknown_type.add(line.topic)
-                lines.append(line)
-        return lines
+                if topic == MESSAGES_LOST:
+                    return False
+                self.subscribed.add(topic)
+                return True
+            case LineKind.TOPIC_LOST:
+                # The child counts from the beginning of the recording.
+                self._lost[topic] = line.count or 0
+            case LineKind.UNKNOWN_TYPE:
+                self.of_unknown_type.add(topic)
+            case LineKind.SEVERAL_TYPES:
+                if not listed.matches(topic):
+                    return False  # it reports topics that it would not record, too
+                self.of_several_types[topic] = now.monotonic_s
+        return self._is_new(line)
 
     def take_lost(self) -> Mapping[str, int]:
         """Returns how many messages of each topic the child has lost since the last call."""
         more, self._lost_before = self._lost - self._lost_before, self._lost.copy()
         return more
+
+    def refused_types(self, now: ClockReading) -> set[str]:
+        """Returns the topics that the child does not subscribe to because of their types."""
+        several = {
+            topic
+            for topic, reported_s in self.of_several_types.items()
+            if now.monotonic_s - reported_s < SETTLE_S
+        }
+        return self.of_unknown_type | several - self.subscribed
 
     def silent_topics(self) -> frozenset[str]:
         """Returns subscribed topics that no closed split has; none before a split is closed."""
@@ -489,7 +514,7 @@ class RecordingSessions:
                 continue
             if not is_ending:
                 deaths += 1
-                self._report_output(session)
+                self._report_output(session, now)
                 sentence = describe_death(status, session.last_output)
                 lived_s = session.age_s(now)
                 self.events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
@@ -559,7 +584,7 @@ class RecordingSessions:
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         """Reads the output and the splits of one child, and reports on them."""
-        self._report_output(session)
+        self._report_output(session, now)
         changes = self._observe_growth(session, now)
         self._learn_closed(session, changes.closed, now)
         for name in changes.empty:
@@ -584,9 +609,11 @@ class RecordingSessions:
         self, session: RecordingSession, closed: Sequence[str], now: ClockReading
     ) -> None:
         """Counts what newly closed splits have received and lost, and flushes them."""
+        since_s = self.closed_s
+        of_types = {topic for topic, at_s in session.of_several_types.items() if at_s > since_s}
         for name in closed:
             self.events.info("split_closed", recording=session.name, file=name)
-            self.orders.reception.learn(session.name, session.splits.directory / name)
+            self.orders.reception.learn(session.name, session.splits.directory / name, of_types)
         if closed or session.state is SessionState.ENDED:
             # After `learn`: what a split itself shows to be missing is counted first.
             lived = session.began.wall, now.wall
@@ -597,19 +624,14 @@ class RecordingSessions:
             self.closed_s = now.monotonic_s
             self._flush_later(session, session.splits.directory, closed)
 
-    def _report_output(self, session: RecordingSession) -> None:
-        lines = session.new_lines()
+    def _report_output(self, session: RecordingSession, now: ClockReading) -> None:
+        lines = session.new_lines(now, self.orders.topics.selection)
         self.events.report_output(session.name, lines)
-        reception = self.orders.reception
         for line in lines:
-            if line.topic is None:
-                continue
-            if line.kind is LineKind.QOS_REFUSED:
+            if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
                 # The line names one policy that does not fit; another line names the other.
-                best_effort = "DURABILITY" not in line.text
-                reception.note_refused(session.name, line.topic, best_effort=best_effort)
-            elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
-                reception.note_unreceived(session.name, line.topic)
+                weak = "DURABILITY" not in line.text
+                self.orders.reception.note_refused(session.name, line.topic, best_effort=weak)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: Sequence[str]
@@ -626,7 +648,7 @@ class RecordingSessions:
             self.events.remark(
                 "rotated_without",
                 f"the new recording does not subscribe to {missing} yet: their publishers have "
-                "gone, or were not discovered in time",
+                "gone, disagree on the type, or were not discovered in time",
                 recording=handover.new.name,
             )
         handover.complete(now)

@@ -153,7 +153,7 @@ class TopicWatch:
                 topics=new,
             )
         self._named_missing |= missing
-        offered = self._offered - current.subscribed - OWN_TOPICS
+        offered = self._offered - current.subscribed - {*self.shortfall.unknown_types} - OWN_TOPICS
         gone = frozenset(filter(self._topics.selection.matches, offered))
         if new := sorted(gone - self.gone):
             sentence = f"no publisher offers {', '.join(new)} any more"
@@ -165,7 +165,7 @@ class TopicWatch:
         if self._began_s is None:
             self._began_s = now_s
         offered = set[str]().union(*(session.subscribed for session in sessions.running))
-        unknown = set[str]().union(*(session.of_unknown_type for session in sessions.running))
+        unknown = current.refused_types(now)
         if len(sessions.running) > 1 or current.age_s(now) < TYPES_S:
             # A new recording has not discovered all topics yet.
             offered.update(self._offered_since_s)
@@ -208,7 +208,7 @@ class TopicWatch:
             for topic in sorted({*matching, *entry.exact}) or [required.topic]:
                 rate = rates_hz.get(topic, 0.0)
                 if topic in unknown:
-                    yield f"{topic}: ros2 bag record does not know its type"
+                    yield f"{topic}: ros2 bag record does not know its type, or knows several"
                 elif topic not in self._offered_since_s:
                     yield f"{topic}: no publisher offers it"
                 elif topic not in heard:

@@ -188,7 +188,7 @@ class Fault(NamedTuple):
         ),
         Fault(
             1,
-            ["recorder: .*does not know the type: /arm -> name the workspace"],
+            ["recorder: .*does not know the type, or .*: /arm -> name the workspace"],
             {"unknown_types": ("/arm",)},
         ),
         Fault(

@@ -23,6 +23,7 @@ from ros2_memory.bag_dir.state_files import (
     read_withheld,
 )
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.background import Background
@@ -334,19 +335,40 @@ def test_a_warning_that_repeats_is_reported_once_for_each_topic_with_what_it_mea
     assert world.logged(3, "unknown_type")
 
 
-@pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
-def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
-    tmp_path: Path, topic: str, found: set[str]
+@pytest.mark.parametrize(("topic", "is_received"), [("/door", True), ("/other", False)])
+def test_while_publishers_disagree_on_a_type_messages_are_missing_and_not_later(
+    tmp_path: Path, topic: str, is_received: bool
 ) -> None:
-    """No QoS would fit it, and no new recording subscribes to it while the old one has it."""
-    world = World(tmp_path)
+    """The recorder repeats it of every topic of the robot, those that it need not record as well.
+
+    No QoS would fit them, and a new recording subscribes to none of several types.
+    """
+    world = World(tmp_path, expected=("/door", "/other"), required=[Required("/other")])
     world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
-    world.started(6)
-    world.recorders[0].lines.append(SEVERAL_TYPES.format(topic))
-    world.run(40)
+    world.started(30)
+    begun = world.wall
+    with capture_logs() as logs:
+        for _ in range(60):
+            for disputed in (topic, "/on/no/list/at_all"):
+                world.running[-1].lines.append(SEVERAL_TYPES.format(disputed))
+            world.run(0.5)
+    over, beat = world.wall, world.heartbeat()
+    assert [topic in each["reason"] for each in events(logs, "several_types")] == [True]
+    assert (beat["unknown_types"], "/on" in beat["last_error"]) == ([topic][is_received:], False)
+    if not is_received:
+        assert "/other" not in beat["missing"]
+        assert beat["required_missing"] == [
+            "/other: ros2 bag record does not know its type, or knows several"
+        ]
+    world.run(60)
+    assert world.heartbeat()["unknown_types"] == []
     assert len(world.recorders) == 1
     losses = read_losses(tmp_path, MIN_NS, MAX_NS)
-    assert {loss.by for loss in losses if loss.topic == topic} == found
+    assert {(loss.topic, loss.by) for loss in losses} == {(topic, "refused")}
+    times = united((loss.start, loss.stop) for loss in losses)
+    [(first, last)] = times
+    assert begun - 11 * NS_PER_S < first <= begun
+    assert over - 6 * NS_PER_S < last < over + 6 * NS_PER_S
 
 
 def test_a_heartbeat_that_cannot_be_written_is_reported_once_and_recording_goes_on(

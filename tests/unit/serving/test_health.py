@@ -214,7 +214,7 @@ async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Pat
     assert report["status"] == "degraded"
     assert report["problems"] == [
         "required, and not recorded: /odom: it came regularly, and is silent",
-        "not recorded, since ros2 bag record does not know the type: /arm",
+        "not recorded, since ros2 bag record does not know the type, or knows several: /arm",
         "offered for 30 s, and no message has come: /scan; look at the users",
         "regular until now, and silent: /odom",
     ]
