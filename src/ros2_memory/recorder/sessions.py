@@ -20,7 +20,6 @@ from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, recording_name
 from ros2_memory.bag_dir.state_files import read_deleted
 from ros2_memory.core.errors import BagError, EpisodicError, RecorderError
-from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Clock, Ns
 from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
@@ -368,10 +367,6 @@ class Orders:
     advice: Callable[[], str] = str
 
 
-WHOLE_RECORDING_S: Final = 15.0
-"""Of a shorter recording, topics without messages are not reported."""
-
-
 @dataclass(eq=False, repr=False)
 class RecordingSessions:
     """The sessions of one bag directory.
@@ -717,33 +712,20 @@ class RecordingSessions:
                 handover.add_late_splits()
         self._update_list(session)
         self.events.note_end(session.name)
-        splits, lived_s = session.splits, session.age_s(now)
+        splits = session.splits
         if remove_if_empty(splits.directory):
             self.events.info("recording_empty", recording=session.name)
         self._flush_later(session, splits.directory, (METADATA_FILE,))
         self._flush_later(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        if lived_s >= WHOLE_RECORDING_S:
-            self._report_silent_topics(session)
         self.events.info(
             "recording_ended",
             recording=session.name,
             splits=len(splits.closed_names),
             messages=splits.messages,
             bytes=splits.bytes_written,
-            lived_s=round(lived_s, 3),
+            lived_s=round(session.age_s(now), 3),
         )
-
-    def _report_silent_topics(self, session: RecordingSession) -> None:
-        silent = sorted(session.subscribed - session.splits.received)
-        if not silent:
-            return
-        sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
-        if not session.splits.received:
-            topics = counted(len(silent), "topic")
-            sentence = f"subscribed to {topics} and received nothing from any of them; "
-            sentence += self.orders.advice()
-        self.events.warn("topics_silent", sentence, recording=session.name)
 
     @contextmanager
     def _reporting_failures(self, session: RecordingSession) -> Iterator[None]:

@@ -485,6 +485,7 @@ def test_a_topic_that_is_offered_and_never_comes_is_named_with_advice(tmp_path: 
     assert unheard["topics"] == ["/door"]
     beat = world.heartbeat()
     assert (beat["state"], beat["unheard"]) == ("recording", ["/door"])
+    assert beat["last_error"] is None
     assert beat["advice"] == "look at the users"
     world.running[-1].heard = ("/bumper", "/door")
     world.run(15)
