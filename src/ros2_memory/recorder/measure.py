@@ -637,19 +637,25 @@ class Arrivals:
     def rates_hz(self, idle: Ns) -> Mapping[str, float]:
         """Returns the messages a second of each topic in the newest data.
 
+        A topic without a message there has the rate of one that comes at this moment.
+
         Args:
             idle: how long nothing at all has come (ns).
         """
         if not self._splits:
             return {}
         start = min(split.start for split in self._splits)
-        duration = max(self._newest + idle - start, 1)
+        now = self._newest + idle
+        duration = max(now - start, 1)
         counts, spans = Counter[str](), defaultdict[str, Spans](list)
         for split in self._splits:
             for name, arrival in split.arrivals.items():
                 counts[name] += arrival.messages
                 spans[name].append((arrival.first, arrival.last))
-        rates: dict[str, float] = {}
+        rates = {
+            name: NS_PER_S / max(now - topic.arrival.last, MEASURED_NS)
+            for name, topic in self._topics.items()
+        }
         for name, of_topic in spans.items():
             # In a rotation two recordings have the same messages.
             twice = _length(of_topic) - _length(united(of_topic))

@@ -643,6 +643,18 @@ def test_who_was_silent_once_is_not_regular_for_an_hour() -> None:
     assert arrivals.silent_topics(20 * NS) == {"odom", "teleop"}
 
 
+def test_a_topic_that_comes_once_a_minute_has_that_rate_between_its_messages() -> None:
+    """`recording.required` may ask for it."""
+    arrivals = Arrivals()
+    for start in range(0, 180, 10):
+        add_splits(arrivals, [start], odom=50)
+        if start % 60 == 0:
+            once = Arrival(start * NS, start * NS)
+            arrivals.add_split(SplitMeasure({}, {}, {"battery": once, "odom": once}))
+        assert arrivals.rates_hz(0)["battery"] >= 1 / 60
+    assert arrivals.rates_hz(30 * NS)["battery"] < 1 / 60
+
+
 def test_a_clock_that_was_set_back_begins_anew() -> None:
     arrivals = Arrivals()
     add_splits(arrivals, (*range(7000, 7060, 10), *range(0, 60, 10)), odom=50)
