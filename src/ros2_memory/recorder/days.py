@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
 from itertools import chain, count, groupby
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -124,6 +124,7 @@ be an accident."""
 COUNTED_S: Final = 600.0
 """How often the rest of that time is written."""
 _EVERYTHING: Final = TimeWindow.everything()
+T = TypeVar("T")
 _TopicType: TypeAlias = tuple[str, str]
 """A topic and its type."""
 
@@ -430,7 +431,8 @@ class MemoryDays:
         """Yields the messages that stay, without people whose label may not stay."""
         topics = [topic for (topic, _), times in selection.times.items() if times]
         for bag in bags:
-            for record in self._readable_records(bag.path, topics):
+            records = self.reader.records(bag.path, topics, _EVERYTHING)
+            for record in self._readable(bag.path, records):
                 channel = record.channel
                 if record.log_time not in selection.times.get((channel.topic, channel.type), ()):
                     continue
@@ -449,39 +451,24 @@ class MemoryDays:
                 if staying is not None:
                     yield staying
 
-    def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
-        """Yields the messages of a bag; damaged ones are left out.
-
-        Raises:
-            BagUnreachableError: the disk fails to read the bag, and may recover.
-        """
-        for record in errors_as_items(self.reader.records(path, topics, _EVERYTHING)):
-            if isinstance(record, BagError):
-                self._lose(path, record)
-            else:
-                yield record
-
     def _tables(self, path: Path) -> Iterator[Table]:
-        """Yields the messages of a bag as tables; damaged ones are left out.
+        """Yields the messages of a bag as tables, as `_readable` does."""
+        for group in self._readable(path, undecoded(self.reader, path, skip_undecodable=True)):
+            yield from group.tables()
+
+    def _readable(self, path: Path, items: Iterator[T]) -> Iterator[T]:
+        """Yields what can be read of a bag; what cannot is logged, and does not stay.
 
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
-        for group in errors_as_items(undecoded(self.reader, path, skip_undecodable=True)):
-            if isinstance(group, BagError):
-                self._lose(path, group)
+        for item in errors_as_items(items):
+            if not isinstance(item, BagError):
+                yield item
+            elif self._failing.may_recover(path, item):
+                raise item
             else:
-                yield from group.tables()
-
-    def _lose(self, path: Path, error: BagError) -> None:
-        """Logs what cannot be read of a bag, and so does not stay.
-
-        Raises:
-            BagUnreachableError: the disk fails to read the bag, and may recover.
-        """
-        if self._failing.may_recover(path, error):
-            raise error
-        _log.warning("memory_not_read", path=str(path), reason=error.reason)
+                _log.warning("memory_not_read", path=str(path), reason=item.reason)
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
         """Returns a message without people whose label may not stay.
