@@ -404,9 +404,10 @@ class TopicThinning:
         ]
         if not states:
             return
-        by_message: list[tuple[object, ...]] = [()] * times.size
+        of_messages: list[list[object]] = [[] for _ in range(times.size)]
         for owner, *values in zip(inner.owners.tolist(), *states, strict=True):
-            by_message[owner] = (*by_message[owner], *values)
+            of_messages[owner] += values
+        by_message = [*map(tuple, of_messages)]
         _, codes = numbered(by_message)
         self._staying += self._changed(path, codes, by_message, times)
 
