@@ -51,6 +51,8 @@ _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
 _MOST_FIELDS: Final = 20
 """Fields of one picture: 300 rows take minutes to lay out."""
+MOST_TOPICS: Final = 200
+"""Rows of topics in one picture: no PNG is as high as 2,500 rows."""
 _PERIODS: Final = 5
 """A step of a signal that is longer than so many usual ones, and than a second, is a gap."""
 _STYLE: Final = {
@@ -192,9 +194,12 @@ def plot_timeline(*, picture: Picture) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
     shown = picture.open_window()
     with spinner("looking what was recorded when"):
-        summary = shown.recap()
-        rows = {**event_rows(shown, summary), **topic_rows(shown)}
-    with picture.figure("Recorded", shown, summary.notes, 1.3 + 0.27 * len(rows)) as figure:
+        summary, topics = shown.recap(), topic_rows(shown)
+        rows = {**event_rows(shown, summary), **dict([*topics.items()][:MOST_TOPICS])}
+    notes = [*summary.notes]
+    if len(topics) > MOST_TOPICS:
+        notes.append(f"{MOST_TOPICS} of {len(topics)} topics are drawn, the first by name")
+    with picture.figure("Recorded", shown, notes, 1.3 + 0.27 * len(rows)) as figure:
         _draw_rows(figure.add_subplot(), rows, shown.span)
 
 

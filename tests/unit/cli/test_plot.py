@@ -105,6 +105,18 @@ def test_a_time_in_which_one_moment_was_recorded_is_drawn(
     assert (tmp_path / "x.svg").is_file()
 
 
+def test_of_very_many_topics_a_timeline_draws_the_first_and_says_how_many_there_are(
+    tmp_path: Path, exits: Program
+) -> None:
+    topics = [f"/t{nth:03}" for nth in range(plot.MOST_TOPICS + 1)]
+    write_mcap(tmp_path / "bag.mcap", [text(T0 + S, "x", topic=topic) for topic in topics])
+    printed = exits(0, f"plot timeline {tmp_path} --out {tmp_path}/x.svg --json").json
+    assert "200 of 201 topics are drawn, the first by name" in printed["notes"]
+    drawn = (tmp_path / "x.svg").read_text()
+    assert "/t199" in drawn
+    assert "/t200" not in drawn
+
+
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
     signals, _ = plot.read_signals(whole_memory(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
