@@ -21,7 +21,10 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import Record
-from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.errors import SizeLimit
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap import bag_file, bulk
+from ros2_memory.storage.mcap.chunk import Chunk, chunk_data
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
@@ -151,6 +154,24 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         last = View(memory, Call()).stream.newest(TOPIC, EVERYTHING)
         assert last is not None
         assert last.time == counted[-1][0]
+
+
+@each_way
+def test_a_chunk_that_no_cache_holds_is_decompressed_once_for_all_messages_that_are_picked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [text(nth * S, f"{nth}") for nth in range(1, 201)])
+    memory = memory_of(tmp_path, reader=McapReader(cache_mb=0), recalls=recalls)
+    view = View(memory, Call())
+    total, chosen = pick(view, "/chatter", EVERYTHING, 100)
+    decompressed: list[int] = []
+
+    def count(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
+        decompressed.append(chunk.offset)
+        return chunk_data(file, chunk, limit)
+
+    monkeypatch.setattr(bag_file, "chunk_data", count)
+    assert (total, len([*chosen]), len(decompressed)) == (200, 100, 1)
 
 
 @each_way
