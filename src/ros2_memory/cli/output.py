@@ -9,9 +9,7 @@ import json
 import math
 import sys
 from contextlib import contextmanager
-from pathlib import Path
 from shutil import get_terminal_size
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
@@ -21,9 +19,11 @@ from rich.text import Text
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.text import leaves
 from ros2_memory.core.timebase import NS_PER_US, local_time
+from ros2_memory.storage.scratch import hidden_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
@@ -68,8 +68,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
         OSError: the block raised one, or the file cannot be renamed; the error names `path`.
     """
     try:
-        with TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as folder:
-            temporary = Path(folder, "written")
+        with hidden_folder(path.parent) as folder:
+            temporary = folder / "written"
             try:
                 yield temporary
             except BagError as error:

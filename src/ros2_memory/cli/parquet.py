@@ -14,8 +14,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
@@ -26,9 +24,11 @@ from ros2_memory.bag_dir.layout import recorded_as
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_DAY, utc_day
+from ros2_memory.storage.scratch import hidden_folder
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
+    from pathlib import Path
 
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.bag_access import StoredMessage
@@ -119,7 +119,7 @@ class Dataset:
         open_parts: dict[tuple[str, int], _PartFile] = {}  # the one used last stands last
         temporary_by_path: dict[Path, Path] = {}
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder, prefix=".") as temporary:
+        with hidden_folder(folder) as temporary:
             for stored in messages:
                 partition = name_of(stored.recording), stored.time // NS_PER_DAY
                 part = open_parts.pop(partition, None)
@@ -127,7 +127,7 @@ class Dataset:
                     if len(open_parts) == _MAX_OPEN_FILES:
                         open_parts.pop(next(iter(open_parts))).close()
                     path = _new_file(folder, *partition, temporary_by_path)
-                    temporary_by_path[path] = Path(temporary, str(len(temporary_by_path)))
+                    temporary_by_path[path] = temporary / str(len(temporary_by_path))
                     part = _PartFile(temporary_by_path[path])
                 open_parts[partition] = part
                 part.add(self._row(stored.record))

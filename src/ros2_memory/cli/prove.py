@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Final, NamedTuple, TypeVar, cast
 
 import typer
@@ -32,6 +31,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
+from ros2_memory.storage.scratch import hidden_folder
 
 Read = TypeVar("Read", Record, Batch)
 
@@ -78,10 +78,10 @@ def prove(
     require_bags(view)
     read, parts, definitions = log.spans(), _parts_without_gaps(view), Definitions(memory.reader)
     own_settings = [word for word in bags.words or () if not is_folder(word)]
-    with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
+    with hidden_folder(output.parent) as folder:
         attempts = _spans_to_copy(view, read, parts, in_one_file=output.suffix == MCAP)
         for number, spans in enumerate(attempts):
-            path = Path(folder) / str(number) / output.name
+            path = folder / str(number) / output.name
             path.parent.mkdir()
             count = _write_copy(path, view, spans, parts, definitions)
             copied = load_to_look(None, [str(path), *LOOKING, *own_settings])

@@ -1,4 +1,8 @@
-"""Temporary files of a reader: copies of bags that are decompressed, or have a journal applied."""
+"""Temporary folders, also of programs that were killed: the next one deletes them.
+
+A reader has copies of bags there that are decompressed, or have a journal applied; a command what
+it has not written whole.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import threading
 import time
 import weakref
 from collections import OrderedDict
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +33,7 @@ Calls the function that it is given with a number of bytes before it writes as m
 """
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _PREFIX = "ros2-memory-unpacked-"
+_HIDDEN = ".ros2-memory-writing-"
 _UNLOCKED_S = 60
 """A folder of less age may be of a program that is about to lock it."""
 
@@ -101,7 +106,7 @@ class Scratch:
         """Makes a copy in a new folder; nothing is left of it after a failure."""
         try:
             if self._root is None or not self._root.exists():
-                _delete_abandoned()
+                _delete_abandoned(Path(tempfile.gettempdir()), _PREFIX)
                 self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
                 weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
                 with suppress(OSError):  # where nothing can be locked, nobody else deletes it
@@ -145,9 +150,27 @@ class Scratch:
         copy.size += size
 
 
-def _delete_abandoned() -> None:
+@contextmanager
+def hidden_folder(parent: Path) -> Iterator[Path]:
+    """Yields a new hidden folder inside another one, and deletes it after the block.
+
+    Those that killed programs left there are deleted before.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    _delete_abandoned(parent, _HIDDEN)
+    with ExitStack() as stack:
+        made = tempfile.TemporaryDirectory(dir=parent, prefix=_HIDDEN, ignore_cleanup_errors=True)
+        folder = Path(stack.enter_context(made))
+        with suppress(OSError):  # where nothing can be locked, nobody else deletes it
+            stack.callback(os.close, _lock(folder))
+        yield folder
+
+
+def _delete_abandoned(parent: Path, prefix: str) -> None:
     """Deletes the folders of programs that were killed: no process has them locked any more."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+    for folder in parent.glob(f"{prefix}*"):
         with suppress(OSError):  # of another user, or in use
             if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
                 descriptor = _lock(folder)

@@ -1,5 +1,8 @@
 """Replies as people read them, in a terminal of 80 columns and in a wide one."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,4 +88,27 @@ def test_of_two_programs_that_write_a_file_at_once_each_writes_a_whole_one(tmp_p
             second.write_text("all of the second")
         assert path.read_text() == "all of the second"
     assert path.read_text() == "all of the first"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_what_a_killed_program_had_not_written_whole_is_deleted_by_the_next_one(
+    tmp_path: Path,
+) -> None:
+    program = (
+        "import os, pathlib, signal, sys\n"
+        "from ros2_memory.cli.output import atomic_file\n"
+        "with atomic_file(pathlib.Path(sys.argv[1])) as half:\n"
+        "    half.write_bytes(b'half')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    path = tmp_path / "window.mcap"
+    subprocess.run([sys.executable, "-c", program, str(path)], check=False)
+    [abandoned] = tmp_path.iterdir()
+    with atomic_file(path) as first:
+        for folder in (abandoned, first.parent):
+            os.utime(folder, (0, 0))
+        first.write_text("first")
+        with atomic_file(path) as second:
+            second.write_text("second")
+    assert path.read_text() == "first"
     assert [*tmp_path.iterdir()] == [path]
