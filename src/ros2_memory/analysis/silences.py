@@ -22,6 +22,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from collections import defaultdict
+from functools import cache
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -141,14 +143,15 @@ def silences(
         together: the topics of each bag; bags with the same topics may be left out.
         gaps: the spans in which nothing was recorded, in order, short pauses too.
     """
-    companions: dict[str, set[str]] = {}
+    bags_with: defaultdict[str, tuple[frozenset[str], ...]] = defaultdict(tuple)
     for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
-            companions.setdefault(topic, set()).update(names)
+            bags_with[topic] += (names,)
+    companions = cache(lambda bags: frozenset[str]().union(*bags))
     robot_on: dict[frozenset[str], list[Span]] = {}
     reported: list[Silence] = []
     for topic, period in periods.items():
-        others = frozenset(companions.get(topic, ()))
+        others = companions(bags_with[topic])
         if others not in robot_on:
             robot_on[others] = robot_on_times([runs_of[other] for other in sorted(others)])
         limit = shortest_silence(period)

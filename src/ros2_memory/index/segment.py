@@ -340,7 +340,7 @@ class Segment:
         headers = [self.headers[nth] for nth in self.positions.get(topic, ())]
         if not headers:
             return None
-        numbers = self._numbers(headers)[:, np.argsort(self._order)]
+        numbers = self._numbers(headers)[:, self._places]
         bags, types = np.nonzero(numbers[:, :, 0].T)
         counts, firsts, lasts = numbers[types, bags].T
         return TopicColumn(bags, firsts, lasts, counts)
@@ -369,6 +369,11 @@ class Segment:
     def _order(self) -> NDArray[np.uint16]:
         """The positions of the bags in the order of `_numbers`."""
         return np.concatenate([alike.rows for alike in self.bags.summaries])
+
+    @cached_property
+    def _places(self) -> Ints:
+        """Where each bag is in the order of `_numbers`."""
+        return np.argsort(self._order)
 
     @cached_property
     def _topics(self) -> list[str]:

@@ -326,12 +326,14 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         recorded = last - first - length_in(snapshot.gaps, first, last)
         usual_period = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual_period, snapshot.longest_silence(topic))
+        longest = max(SILENT_AFTER_NS, longest)
+        if latest - last <= longest:
+            continue  # as most topics: what was excluded or cut is not looked at
         since = TimeWindow(last + 1, latest + 1)
         unrecorded = united([*excluded_spans(memory.bag_dir, since), *snapshot.gaps])
         silent = latest - last - length_in(unrecorded, last, latest)
         is_cut = bool(cut_spans(memory.bag_dir, topic, since))
-        is_long = silent > max(SILENT_AFTER_NS, longest)
-        if is_long and not is_cut and not are_unlisted(memory, [topic]):
+        if silent > longest and not is_cut and not are_unlisted(memory, [topic]):
             yield SilentTopic(topic, last)
 
 
@@ -465,10 +467,13 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
         return None
     last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
     window = TimeWindow.before(last, _RATE_WINDOW_NS)
-    bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
-    parts = [part for bag in bags if not is_thinned(bag.file) for part in bag.summary.of(topic)]
-    intervals = sum(part.count - 1 for part in parts)
-    duration = sum(part.last - part.first for part in parts)
+    intervals = duration = 0
+    for segment in snapshot.timeline.segments_in(window):
+        column = segment.unthinned and segment.unthinned.column(topic)
+        if column is not None:
+            rows = window.overlapping(column.firsts, column.lasts)
+            intervals += int((column.messages[rows] - 1).sum())
+            duration += int((column.lasts - column.firsts)[rows].sum())
     if not intervals or duration < _SHORTEST_RATED_NS:
         return None
     return round(intervals / unix_from_ns(duration), 2)

@@ -42,6 +42,7 @@ from ros2_memory.history.condition_hints import constants_named, position_frames
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.detections import LONGEST_LATENCY_NS, stamp_of
+from ros2_memory.history.lasting import is_text
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.scan import scan
@@ -199,7 +200,8 @@ def describe_hung(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each detector that repeats one message at the end of a window."""
     for topic in topics_with_detections(view.timeline):
         with suppress(NotInLakeError):
-            since = _hung_since(view, topic, window)
+            # A plain text has no stamp.
+            since = None if is_text(view, topic) else _hung_since(view, topic, window)
             if since is not None:
                 yield (
                     f"{topic} repeats its message of {unix_text(since)} again and again: its "
