@@ -17,9 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.temporary import hidden_folder
 from ros2_memory.core.text import leaves
 from ros2_memory.core.timebase import NS_PER_US, local_time
-from ros2_memory.storage.scratch import hidden_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

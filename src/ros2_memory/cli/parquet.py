@@ -22,9 +22,9 @@ import pyarrow.parquet as pq
 
 from ros2_memory.bag_dir.layout import recorded_as
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.temporary import hidden_folder
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_DAY, utc_day
-from ros2_memory.storage.scratch import hidden_folder
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable

@@ -24,6 +24,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import MCAP, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
+from ros2_memory.core.temporary import hidden_folder
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Span
 from ros2_memory.history.bag_access import StoredMessage
@@ -31,7 +32,6 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
-from ros2_memory.storage.scratch import hidden_folder
 
 Read = TypeVar("Read", Record, Batch)
 

@@ -469,7 +469,8 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     window = TimeWindow.before(last, _RATE_WINDOW_NS)
     intervals = duration = 0
     for segment in snapshot.timeline.segments_in(window):
-        column = segment.unthinned and segment.unthinned.column(topic)
+        whole = segment.unthinned
+        column = None if whole is None else whole.column(topic)
         if column is not None:
             rows = window.overlapping(column.firsts, column.lasts)
             intervals += int((column.messages[rows] - 1).sum())

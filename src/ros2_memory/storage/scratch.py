@@ -1,26 +1,21 @@
-"""Temporary folders, also of programs that were killed: the next one deletes them.
-
-A reader has copies of bags there that are decompressed, or have a journal applied; a command what
-it has not written whole.
-"""
+"""Temporary files of a reader: copies of bags that are decompressed, or have a journal applied."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import shutil
 import tempfile
 import threading
-import time
 import weakref
 from collections import OrderedDict
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from ros2_memory.core.temporary import delete_abandoned, lock_folder
 from ros2_memory.storage.errors import UnreachableError, UnreadableError
 
 if TYPE_CHECKING:
@@ -33,9 +28,6 @@ Calls the function that it is given with a number of bytes before it writes as m
 """
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 _PREFIX = "ros2-memory-unpacked-"
-_HIDDEN = ".ros2-memory-writing-"
-_UNLOCKED_S = 60
-"""A folder of less age may be of a program that is about to lock it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -106,11 +98,11 @@ class Scratch:
         """Makes a copy in a new folder; nothing is left of it after a failure."""
         try:
             if self._root is None or not self._root.exists():
-                _delete_abandoned(Path(tempfile.gettempdir()), _PREFIX)
+                delete_abandoned(Path(tempfile.gettempdir()), _PREFIX)
                 self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
                 weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
                 with suppress(OSError):  # where nothing can be locked, nobody else deletes it
-                    weakref.finalize(self, os.close, _lock(self._root))
+                    weakref.finalize(self, os.close, lock_folder(self._root))
             copy = _Copy(Path(tempfile.mkdtemp(dir=self._root)))
         except OSError as error:
             raise _disk_full(error) from error
@@ -148,49 +140,6 @@ class Scratch:
             )
         self._bytes += size
         copy.size += size
-
-
-@contextmanager
-def hidden_folder(parent: Path) -> Iterator[Path]:
-    """Yields a new hidden folder inside another one, and deletes it after the block.
-
-    Those that killed programs left there are deleted before.
-
-    Raises:
-        OSError: it cannot be made.
-    """
-    _delete_abandoned(parent, _HIDDEN)
-    with ExitStack() as stack:
-        made = tempfile.TemporaryDirectory(dir=parent, prefix=_HIDDEN, ignore_cleanup_errors=True)
-        folder = Path(stack.enter_context(made))
-        with suppress(OSError):  # where nothing can be locked, nobody else deletes it
-            stack.callback(os.close, _lock(folder))
-        yield folder
-
-
-def _delete_abandoned(parent: Path, prefix: str) -> None:
-    """Deletes the folders of programs that were killed: no process has them locked any more."""
-    for folder in parent.glob(f"{prefix}*"):
-        with suppress(OSError):  # of another user, or in use
-            if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
-                descriptor = _lock(folder)
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(descriptor)
-
-
-def _lock(folder: Path) -> int:
-    """Locks a folder while this process lives, and returns its descriptor.
-
-    Raises:
-        OSError: another has it, or it cannot be locked.
-    """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
 
 
 def _disk_full(error: OSError) -> UnreachableError:
