@@ -60,6 +60,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.context import short_name
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import absent_files
+from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -488,16 +489,22 @@ def lost_in(
 ) -> list[SetAside]:
     """Returns the unread files, and `absent` ones, that probably have messages in a window.
 
-    With `nothing`, files that possibly have some.
+    With `nothing`, files that possibly have some. The newest is the last.
     """
     spans = snapshot.unread_bounds if nothing else snapshot.unread_spans
     if absent:
         spans = {**snapshot.bounds_of(absent), **spans}
-    return [
+    lost = (
         aside
         for aside in (*absent, *snapshot.damaged, *snapshot.unread)
         if _touches(spans[aside], window, unknown=nothing)
-    ]
+    )
+
+    def order(aside: SetAside) -> tuple[Ns, int]:
+        span, (_, number) = spans[aside], split_of(str(aside.path)) or ("", 0)
+        return MIN_NS if span is None else span.start, number
+
+    return sorted(lost, key=order)
 
 
 def being_written(

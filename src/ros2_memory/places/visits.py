@@ -27,7 +27,7 @@ from ros2_memory.analysis.motion.robot_track import (
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Region, Steps, contains, plan_of
-from ros2_memory.core.spans import Spans, united
+from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, Span, ns_from_unix
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
@@ -334,6 +334,7 @@ class ConfirmedStays:
         self.known = known_track(view, frame_id, window)
         self.elapsed = view.elapsed_in(window)
         self._region, self._window, self._scope = region, window, scope
+        self._misdated = united(fault.span for fault in view.snapshot.misdated)
         # A shown visit begins at one of the poses by which it was confirmed.
         self._poses = lru_cache(2 * _MOST_TRIED)(TrackReader(view, frame_id).poses)
         by_track = [
@@ -379,10 +380,16 @@ class ConfirmedStays:
         entries, exits = self.entries, self.exits
         first = last = None
         if entries:
-            first = self._between_poses(entries[-1]).start
+            first = self._between_poses(self._dated(entries)[-1]).start
         if exits:
-            last = self._between_poses(max(exits, key=lambda visit: visit.inside.stop)).stop
+            newest = max(self._dated(exits), key=lambda visit: visit.inside.stop)
+            last = self._between_poses(newest).stop
         return PlaceVisits(name, len(entries), len(exits), self.duration, first, last)
+
+    def _dated(self, visits: Sequence[TrackedStay]) -> Sequence[TrackedStay]:
+        """Returns the visits that no wrong clock dated; all if it dated all."""
+        dated = [each for each in visits if not overlaps_any(self._misdated, *each.inside.span)]
+        return dated or visits
 
     def shown(self, visit: TrackedStay, newest: Ns | None) -> Visit:
         """Returns a visit as the reply shows it.

@@ -281,6 +281,21 @@ def test_many_topics_that_are_not_read_hide_no_damaged_file(tmp_path: Path, reca
     assert unread.startswith("could not be read, so messages may be missing: f/f_0.mcap")
 
 
+def test_of_several_files_that_are_not_read_the_newest_is_named(tmp_path: Path) -> None:
+    """Not the last by name: rec_10 comes before rec_9 there."""
+    for nth in range(12):
+        path = tmp_path / "rec" / f"rec_{nth}.mcap"
+        if nth in {9, 10}:
+            tear(path)
+        else:
+            write_mcap(path, along_x(T0 + nth * 10 * S, 9))
+    never = {"topic": "/odom", "condition_type": "contains", "value": "never seen"}
+    notes = asked(memory_of(tmp_path), "find_last_match", **never)["notes"]
+    [said] = [note for note in notes if note.startswith("could not be read")]
+    assert "rec/rec_10.mcap" in said
+    assert "and 1 more" in said
+
+
 @pytest.mark.parametrize("topics", [1, 3])
 def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
     tmp_path: Path, topics: int

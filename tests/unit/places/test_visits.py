@@ -25,6 +25,7 @@ from ros2_memory.places.visits import visits
 from tests.support.bags import (
     McapLayout,
     Msg,
+    along_x,
     boolean,
     diagnostics,
     odom,
@@ -340,6 +341,16 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
         assert by_name[name].first == arrivals[-1]
     assert by_name["garden"].entries == 0
     assert "left out, as in elsewhere: yard" in str(found.notes)
+
+
+def test_the_first_entry_is_none_that_a_wrong_clock_dated(tmp_path: Path) -> None:
+    """Unless all are: a robot whose clock is not set at its start drives in 1970."""
+    for name, begin in (("unset", 1000 * S), ("rec", T0 * S), ("later", (T0 + 3600) * S)):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", along_x(begin, 60, mps=0.5))
+    memory = spots(memory_of(tmp_path), den=Circle(10.0, 0.0, 2.0))
+    [den] = asked(memory, "visits")["places"]
+    assert (den["entries"], den["first_entry"]) == (3, T0 + 16)
+    assert "dated by a wrong clock" in str(asked(memory, "visits")["notes"])
 
 
 def test_times_of_places_that_overlap_are_noted_as_counted_to_both(moving: Memory) -> None:
