@@ -34,7 +34,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import MCAP, BagFile, BagState, SetAside
 from ros2_memory.core.text import counted, listed, match_topics, similar
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_HOUR, Ns, iso_local, unix_from_ns
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.context import Call, Memory, short_name
 from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.driven_path import (
     frame_of_newest_pose,
@@ -45,6 +45,7 @@ from ros2_memory.history.no_data import nothing_here
 from ros2_memory.history.robots import ADVICE, describe_mixed
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import open_view
+from ros2_memory.index.bag_table import alike_bags, digest_of
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
@@ -351,11 +352,28 @@ def _faults(
             wrong = "in contradiction with what is in it"
             do = "nothing is missing: what it states of itself is wrong, not its messages"
         yield _Fault("bag", wrong, do), f"{bag.path.name} ({'; '.join(bag.summary.notes)})"
+    for bag in _copied(snapshot):
+        do = "each message counts once; delete the copies, or serve another folder"
+        yield _Fault("bag", "copied into a second folder", do), short_name(bag.path)
     for topic in covered.undecodable:
         do = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
         if _MSG_FOLDERS in topic.reason:  # a definition is missing
             do = f"name the folder with the .msg or .action files in {_MSG_FOLDERS}"
         yield _Fault("topic", "cannot be decoded", do), f"{topic.topic} ({topic.reason})"
+
+
+def _copied(snapshot: Snapshot) -> Iterator[BagFile]:
+    """Yields the bags that are copies of bags in other folders, but for those of the recorder."""
+    for alike in alike_bags(snapshot.timeline, anywhere=True):
+        digests: set[bytes] = set()
+        for bag in alike:
+            if is_derived(bag.path) or f"/{MOMENTS_FOLDER}/" in bag.file:
+                continue
+            with suppress(OSError):
+                digest = digest_of(bag)
+                if digest in digests:
+                    yield bag
+                digests.add(digest)
 
 
 def _remedy(file: SetAside, memory: Memory) -> str:

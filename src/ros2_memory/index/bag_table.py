@@ -181,11 +181,11 @@ class BagTable:
         """Returns the bags that are copies of others in their folder; reads each suspect once."""
         known, self._digests = self._digests, {}
         copies: list[BagFile] = []
-        for alike in _alike_bags(self._timeline):
+        for alike in alike_bags(self._timeline):
             originals: set[bytes] = set()
             for bag in alike:
                 with suppress(OSError):
-                    digest = self._digests[bag] = known.get(bag) or _digest(bag)
+                    digest = self._digests[bag] = known.get(bag) or digest_of(bag)
                     if digest in originals:
                         copies.append(bag)
                     originals.add(digest)
@@ -407,21 +407,24 @@ def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
     return tuple(sorted(asides, key=lambda aside: aside.path))
 
 
-def _alike_bags(timeline: Timeline) -> Iterator[list[BagFile]]:
-    """Yields the bags of one folder that have one size and one summary, the shortest name first."""
+def alike_bags(timeline: Timeline, *, anywhere: bool = False) -> Iterator[list[BagFile]]:
+    """Yields the bags that have one size and one summary, the shortest name first.
+
+    They are those of one folder, or `anywhere`.
+    """
     starts = timeline.starts
     is_same = starts[1:] == starts[:-1]
     are_suspects = np.append(is_same, False) | np.append(False, is_same)
     edges = np.cumsum([len(segment.bags) for segment in timeline.segments])
     of_segments = zip(timeline.segments, np.split(are_suspects, edges), strict=False)
     suspects = chain.from_iterable(segment.bags.at(rows) for segment, rows in of_segments)
-    alike: defaultdict[tuple[Path, int, BagSummary], list[BagFile]] = defaultdict(list)
+    alike: defaultdict[tuple[Path | None, int, BagSummary], list[BagFile]] = defaultdict(list)
     for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
-        alike[bag.recording, bag.size, bag.summary].append(bag)
+        alike[None if anywhere else bag.recording, bag.size, bag.summary].append(bag)
     return (bags for bags in alike.values() if len(bags) > 1)
 
 
-def _digest(bag: BagFile) -> bytes:
+def digest_of(bag: BagFile) -> bytes:
     """Returns a digest of blocks spread over a bag.
 
     Equal times and sizes prove nothing: two runs of a simulation may have them.

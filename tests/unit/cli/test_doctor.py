@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -279,6 +280,21 @@ def enveloped(writer: Writer, at: int) -> None:
     schema = writer.register_schema("keelson.Envelope", "protobuf", b"")
     channel = writer.register_channel("/keelson", "protobuf", schema)
     writer.add_message(channel, at, b"\x08\x01", at)
+
+
+def test_a_folder_that_lies_there_twice_is_named_and_a_run_of_equal_times_is_not(
+    tmp_path: Path, examined: Examined
+) -> None:
+    for name, mps in (("run", 0.1), ("other", 0.2)):
+        for nth in range(2):
+            path = tmp_path / "bags" / name / f"{name}_{nth}.mcap"
+            write_mcap(path, along_x((1000 + 60 * nth) * NS_PER_S, 60, mps=mps))
+    shutil.copytree(tmp_path / "bags" / "run", tmp_path / "bags" / "run copied")
+    wrong = examined(1, f"recorder=none {tmp_path}/bags")["bags"]
+    [copied] = [each for each in wrong if "second folder" in each["seen"]]
+    assert copied["seen"] == (
+        "2 bags copied into a second folder: run copied/run_0.mcap, run copied/run_1.mcap"
+    )
 
 
 def test_places_that_are_refused_are_of_one_robot_of_a_fleet(
