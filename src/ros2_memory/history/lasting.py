@@ -249,6 +249,20 @@ def is_text(view: View, topic: str) -> bool:
     return set(view.timeline.types_of(topic)) == {TEXT}
 
 
+def says_events(view: View, topic: str) -> bool:
+    """Returns whether each message of a topic is an event: of a log, or a text now and then.
+
+    Texts that come regularly, or more often than every `SILENCE_NS`, describe what goes on.
+    """
+    heard = _heard_in(view, topic) if is_text(view, topic) else []
+    length = sum(each.stop - each.start for each in heard)
+    is_seldom = length > SILENCE_NS * sum(each.messages for each in heard)
+    is_paced = any(
+        each.is_frequent or _pause_in(view, topic, each) > SILENCE_NS for each in heard if is_seldom
+    )
+    return view.timeline.is_log(topic) or (is_seldom and not is_paced)
+
+
 def lasting_of(view: View, topic: str, *, states: bool) -> Lasting:
     """Returns the `Lasting` of a topic, which is made once in a call."""
     known = view.memo.of(_LASTING, dict)

@@ -18,7 +18,13 @@ from ros2_memory.core.arrays import rows_of, stable_order, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.history.lasting import Lasting, held_until, is_latched, lasting_of
+from ros2_memory.history.lasting import (
+    Lasting,
+    held_until,
+    is_latched,
+    lasting_of,
+    says_events,
+)
 from ros2_memory.history.reverse_search import MET, NOT_MET, Block, ReverseSearch, Tested
 
 if TYPE_CHECKING:
@@ -246,14 +252,14 @@ def find_runs(
     """
     # Messages outside of a scope are not read, and may well be decodable.
     search.ruled_out = scope.is_bounded
-    topics, is_log = search.topics, view.timeline.is_log
+    topics = search.topics
     latched = [topic for topic in topics if scope.is_bounded and is_latched(view, topic)]
     if latched:
         enough = None
     by_topic = {
         topic: _TopicRuns(
             nth,
-            apart=is_log(topic),
+            apart=says_events(view, topic),
             lasting=lasting_of(view, topic, states=is_flag(search.condition)),
         )
         for nth, topic in enumerate(topics)

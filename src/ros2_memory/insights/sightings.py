@@ -3,7 +3,8 @@
 A sighting is a run of consecutive messages of one topic that meet a condition. It ends with a
 message that does not, and, unless the topic is latched, where it is silent for longer than
 `silence_of` says: a detector may publish only what it sees. A message that cannot be decoded is
-neither a match nor an end. In a topic of statuses each goal is a sighting, in a log each message.
+neither a match nor an end. In a topic of statuses each goal is a sighting, in a log, or where texts
+come now and then, each message.
 In one of diagnostics each node has sightings of its own.
 """
 
@@ -47,6 +48,7 @@ from ros2_memory.history.lasting import (
     is_latched,
     is_text,
     lasting_of,
+    says_events,
 )
 from ros2_memory.history.no_data import matching_topics, require_fields, require_recorded
 from ros2_memory.history.reverse_search import MET, UNKNOWN, ReverseSearch
@@ -415,6 +417,8 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
 
 def _matched_before(view: View, search: ReverseSearch, run: Run) -> bool:
     """Returns whether a run of matches goes on from a match before what was searched."""
+    if says_events(view, run.topic):
+        return False
     states = is_flag(search.condition)
     longest = lasting_of(view, run.topic, states=states).pause(run.first)
     if longest == MAX_NS:
@@ -457,10 +461,11 @@ def _notes_on_moments(view: View, topics: Iterable[str]) -> Iterator[str]:
         types = view.timeline.types_of(topic)
         is_plain = what == "text" or all(name.startswith(NUMBERS) for name in types)
         if is_plain and not is_latched(view, topic):
+            often = ", and matches in a row less than 10 s apart once"
             yield (
-                f"a {what} on {topic} counts for the moment in which it was said, and matches in a "
-                "row less than 10 s apart once: get_topic_in_range lists each; its changes, and by "
-                "value, have for how long each held until the next one"
+                f"a {what} on {topic} counts for the moment in which it was said"
+                f"{'' if says_events(view, topic) else often}: get_topic_in_range lists each; its "
+                "changes, and by value, have for how long each held until the next one"
             )
 
 

@@ -1022,13 +1022,17 @@ def test_a_topic_with_a_dot_in_its_name_is_read_beside_another(tmp_path: Path, n
     assert "drive" in str(row["with"])
 
 
-def test_calls_within_ten_seconds_are_noted_as_one(tmp_path: Path) -> None:
+@each_way
+def test_each_call_of_a_tool_counts_however_soon_it_is_called_again(
+    tmp_path: Path, recalls: bool
+) -> None:
     """A planner calls a tool again where it failed: two calls are no single one."""
     calls = [(0, "drive"), (40, "grasp"), (48, "grasp"), (70, "grasp"), (90, "say")]
     said = [text(BEGIN + at * S, f'{{"tool": "{name}"}}', "/trace") for at, name in calls]
     beats = [boolean(BEGIN + at * S // 10, data=False, topic="/beat") for at in range(1000)]
-    memory = remembered(tmp_path, in_order([*said, *beats]), recalls=False)
+    memory = remembered(tmp_path, in_order([*said, *beats]), recalls=recalls)
     sought = {"condition_type": "equals", "field": "data.tool", "value": "grasp"}
     rows = asked(memory, "find_matches", topic="/trace", by="day", **sought)
-    assert table(rows)["all"]["count"] == 2
-    assert "matches in a row less than 10 s apart once" in str(rows["notes"])
+    assert table(rows)["all"]["count"] == 3
+    found = asked(memory, "find_matches", topic="/trace", **sought)
+    assert [row["last_seen"] - T0 for row in found["sightings"]] == [70.0, 48.0, 40.0]
