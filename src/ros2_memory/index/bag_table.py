@@ -258,7 +258,8 @@ class BagTable:
             and notes.trusted
             # A compressed bag may lie beside the file it was made from.
             and notes.kind in PLAIN_KINDS
-            and notes.stamp.mtime_ns < context.settled_before
+            # Or in the future: a robot without a battery-backed clock starts in 1970.
+            and abs(context.now - notes.stamp.mtime_ns) > context.settling_ns
             and path not in self._watched
             and other_form(path) not in self._files
         )
@@ -281,7 +282,7 @@ class BagTable:
                 is_same = stamp.content == content
                 are_settled[row] &= (
                     is_same
-                    and stamp.mtime_ns < context.settled_before
+                    and context.now - stamp.mtime_ns > context.settling_ns
                     and path.endswith(kinds)
                     and not (compressed and other_form(path) in compressed)
                 )

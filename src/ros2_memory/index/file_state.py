@@ -115,9 +115,9 @@ class ScanContext:
     _listed: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     @property
-    def settled_before(self) -> Ns:
-        """The time before which a closed file changed last, if it does not change any more."""
-        return self.now - max(self.three_splits, YOUNG_NS)
+    def settling_ns(self) -> Ns:
+        """How long a closed file may still change after its last change."""
+        return max(self.three_splits, YOUNG_NS)
 
     @cached_property
     def withheld(self) -> Withheld:

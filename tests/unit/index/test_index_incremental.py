@@ -354,6 +354,21 @@ def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dat
     assert odometry["count"] == 20
 
 
+@pytest.mark.parametrize("now", [NOW, 1000 * S])
+def test_there_are_no_notes_on_closed_bags_even_if_the_clock_is_not_set_yet(
+    tmp_path: Path, now: int
+) -> None:
+    """A robot without a battery-backed clock starts in 1970, with a week of bags."""
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(NOW - 7200 * S, 0.0, 0.0)])
+    os.utime(path, ns=(LONG_AGO, LONG_AGO))
+    index = memory_of(tmp_path, clock=SettableClock(now)).index
+    with index.undisturbed() as snapshot:
+        assert [bag.path for bag in snapshot.bags] == [path]
+        assert not index.known_bags((), snapshot).files
+    path.unlink()
+    assert not index.refresh().bags
+
+
 @pytest.mark.parametrize(("name", "bags"), [("rec_1", 1), ("sample", 2)])
 def test_a_split_that_a_kill_left_in_both_forms_counts_once(
     tmp_path: Path, name: str, bags: int
