@@ -37,7 +37,8 @@ def write_durably(target: Path, text: str, *, mode: int | None = None) -> None:
     `mode` sets the file's permissions; None leaves them to the umask.
 
     Raises:
-        OSError: the file cannot be written; the old one remains.
+        OSError: the file cannot be written, and the old one remains; or it was replaced, and a
+            power cut may undo that.
     """
     write_all_durably({target: text}, mode=mode)
 
@@ -48,7 +49,7 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
     So a full disk leaves all files as they are; a power cut may come between two of them.
 
     Raises:
-        OSError: a file cannot be written; `filename` names it.
+        OSError: as by `write_durably`; `filename` names the file.
     """
     temporary = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:
@@ -81,9 +82,9 @@ def append_durably(target: Path, text: str) -> None:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file", str(target))
+        if not status.st_size:
+            flush(target.parent)
         append_lines(descriptor, text)
-    if not status.st_size:
-        flush(target.parent)
 
 
 @contextmanager

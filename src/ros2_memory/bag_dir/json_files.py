@@ -194,7 +194,7 @@ class JsonLog(_JsonFile[_T]):
         """Replaces the rows by what `changed` returns of them. Who appends waits meanwhile.
 
         Raises:
-            OSError: the file cannot be read or written; the old one remains.
+            OSError: the file cannot be read, or as by `write_durably`.
             ValueError: it is not a regular file.
         """
         with locked(bag_dir / self.name):
@@ -204,7 +204,7 @@ class JsonLog(_JsonFile[_T]):
         """Replaces all rows, of a log that has one writer.
 
         Raises:
-            OSError: the file cannot be written; the old one remains.
+            OSError: as by `write_durably`.
         """
         self._replace(bag_dir, self.text(rows))
 
@@ -237,7 +237,7 @@ class JsonDocument(_JsonFile[_T]):
         """Replaces the file durably.
 
         Raises:
-            OSError: the file cannot be written; the old one remains.
+            OSError: as by `write_durably`.
         """
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
         # ASCII with escapes: a path that is not UTF-8 has lone surrogates.
@@ -248,7 +248,7 @@ class JsonDocument(_JsonFile[_T]):
         """Removes the file durably.
 
         Raises:
-            OSError: the file cannot be removed.
+            OSError: the file cannot be removed; or it was, and a power cut may undo that.
         """
         target = bag_dir / self.name
         target.unlink(missing_ok=True)

@@ -213,11 +213,11 @@ class TopicCutter:
         ]
         bag = os.path.relpath(path, self.bag_dir)
         expired = self._read_expired()
-        EXPIRED.write(self.bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
         if receipt is not None and receipt.size != before.st_size:
             receipt = None  # the bag has changed since it was shipped
         try:
+            EXPIRED.write(self.bag_dir, expired.then(bag, losses))
             with rewrite_without(
                 self.bag_dir,
                 path,

@@ -46,7 +46,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import reason_of, rewrite_without
+from ros2_memory.retention.repair import UnflushedError, reason_of, rewrite_without
 from ros2_memory.triggers.exclusion import (
     Cut,
     ExclusionRule,
@@ -435,10 +435,13 @@ class Screening:
             if split_number(recording, file) is None:
                 raise BagError(str(path), "it is not named as a split of its recording")
             status = path.lstat()
-            with rewrite_without(
-                self.bag_dir, path, status, self.writer, takes=cut.takes, expected=gone
-            ):
-                pass
+            try:
+                with rewrite_without(
+                    self.bag_dir, path, status, self.writer, takes=cut.takes, expected=gone
+                ):
+                    pass
+            except UnflushedError as error:
+                _log.warning("exclusion_unflushed", recording=recording, reason=str(error))
             _log.info("messages_excluded", recording=recording, file=file, messages=gone.total())
         self._excluded_latched -= newest.keys()
         self._excluded_latched |= {topic for topic, (_, excluded) in newest.items() if excluded}

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir import state_files
+from ros2_memory.bag_dir import durable_write, state_files
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
 from ros2_memory.bag_dir.own_recordings import LIST
@@ -416,6 +416,17 @@ def test_where_a_file_cannot_be_read_nothing_is_lost_or_shipped_and_all_is_held_
     assert unshipped(tmp_path, [("a", 1)]) == {"a"}
     assert read_withheld(tmp_path).holds(name, "a.mcap")
     assert not read_withheld(tmp_path).holds("copied", "a.mcap")
+
+
+def test_rows_that_were_not_appended_since_the_disk_fails_are_not_there_twice_then(
+    tmp_path: Path,
+) -> None:
+    loss = Loss("/odom", 0, 9, 4, "stamps")
+    with broken(durable_write, "flush", errno.EIO), pytest.raises(OSError, match="Input/output"):
+        append_losses(tmp_path, [loss])
+    assert read_losses(tmp_path, 0, 9) == []
+    append_losses(tmp_path, [loss])
+    assert read_losses(tmp_path, 0, 9) == [loss]
 
 
 # The lake deletes by this file: no line of it may be passed over in silence.

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from ros2_memory.bag_dir import durable_write
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
@@ -187,6 +188,14 @@ def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
     house(bag_dir, **why).apply()
     assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
     assert not (bag_dir / EXPIRED_FILE).exists()
+
+
+def test_what_was_not_cut_since_the_disk_fails_is_not_said_to_be_deleted(bag_dir: Path) -> None:
+    expired = bag_dir / EXPIRED_FILE
+    with broken(durable_write, "flush", errno.EIO, where=lambda _: expired.exists()):
+        house(bag_dir).apply()
+    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
+    assert "deleted by" not in str(reply_over(bag_dir, "memory_status"))
 
 
 def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> None:

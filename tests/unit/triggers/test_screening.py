@@ -1,7 +1,9 @@
 """Splits that are screened before they are served, with real files."""
 
+import errno
 import itertools
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -196,7 +198,10 @@ def test_a_latched_message_that_was_excluded_long_ago_does_not_come_back(
     assert bags.seconds("/map") == [1.0, 121.0]
 
 
-def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: ScreenedBags) -> None:
+@pytest.mark.parametrize("flushes", [True, False])
+def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(
+    bags: ScreenedBags, *, flushes: bool
+) -> None:
     name = bags.begin(0)
     # Nothing is known of the mode yet: what the next recording receives again may be served.
     bags.split(name, [word(1, "/map"), *words(0, 10)])
@@ -206,8 +211,10 @@ def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: Screened
     bags.split(name, [on(22), word(25, "/map"), *words(20, 30)])
     bags.split(name, [off(32), *words(30, 40)])
     bags.split(name, words(40, 50))
-    bags.step()
+    with nullcontext() if flushes else broken(repair, "flush", errno.EIO):
+        bags.step()
     assert bags.screening.excluded_latched() == {"/map"}
+    assert bags.screening.problem() is None
     bags.split(name, [word(55, "/map"), *words(50, 60)])
     bags.end()
     assert bags.screening.excluded_latched() == set()
