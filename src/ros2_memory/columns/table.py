@@ -30,7 +30,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.core.arrays import entries_of_codes, joined_codes, numbered, range_numbers
+from ros2_memory.core.arrays import (
+    entries_of_codes,
+    joined_codes,
+    numbered,
+    range_numbers,
+    renumbered,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -160,8 +166,8 @@ class Texts:
         codes = self.codes[positions]
         if len(self.words) <= 1:
             return Texts(codes, self.words if codes.size else ())
-        used, new_codes = numbered(codes.tolist())
-        return Texts(new_codes.astype(np.uint32), tuple(self.words[code] for code in used))
+        used, new_codes = renumbered(codes, len(self.words))
+        return Texts(new_codes.astype(np.uint32), tuple(self.words[code] for code in used.tolist()))
 
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:

@@ -186,6 +186,22 @@ def numbered(values: Iterable[Word]) -> tuple[tuple[Word, ...], Ints]:
     return tuple(code_of), np.array(codes, np.int64)
 
 
+def renumbered(codes: Codes, count: int) -> tuple[Ints, Ints]:
+    """Returns which codes below a count occur, in order of first appearance, and each one's index.
+
+    The same as `numbered`, several times as fast where most of the codes may occur.
+    """
+    if count > _KEYS_OF_ROW * codes.size:
+        occurring, indexes = numbered(codes.tolist())
+        return np.array(occurring, np.int64), indexes
+    first = np.full(count, codes.size)
+    first[codes[::-1]] = np.arange(codes.size)[::-1]  # of equal codes the last assignment stays
+    used = np.argsort(first, kind="stable")[: np.count_nonzero(first < codes.size)]
+    index_of = np.empty(count, np.int64)
+    index_of[used] = np.arange(used.size)
+    return used, index_of[codes]
+
+
 def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, tuple[Word, ...]]:
     """Joins columns of codes, each with a list of the words it means, into one with one list."""
     code_of: dict[Word, int] = {}

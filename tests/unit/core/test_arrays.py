@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.arrays import Columns, distinct_rows, gathered
+from ros2_memory.core.arrays import Columns, distinct_rows, gathered, numbered, renumbered
 
 
 def test_nothing_is_gathered_behind_the_end() -> None:
@@ -41,3 +41,10 @@ def test_distinct_rows_are_those_in_order_however_many_there_may_be(
 
     assert found.tolist() == sorted(map(list, {*map(tuple, table.tolist())}))
     assert found[number].tolist() == table.tolist()
+
+
+@given(st.lists(st.integers(0, 9), max_size=40), st.integers(10, 400))
+def test_codes_are_numbered_in_order_of_first_appearance(codes: list[int], count: int) -> None:
+    used, indexes = renumbered(np.array(codes, np.uint32), count)
+    expected, expected_indexes = numbered(codes)
+    assert (tuple(used.tolist()), indexes.tolist()) == (expected, expected_indexes.tolist())
