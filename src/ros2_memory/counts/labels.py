@@ -1,5 +1,6 @@
 """How often and how long each label of detections was in view, and how many were seen at once.
 
+Spellings of a label ("Mug", "mugs") are one, as of things, under the most frequent of them.
 A thing is in view as in a recap: a detector may miss it for `FLICKER_NS`, and it is gone after
 `SILENCE_NS` without a message. Only detections that lie in the scope of the question, and that
 have its least score, count.
@@ -23,7 +24,7 @@ from ros2_memory.analysis.intervals import (
     visible_in,
 )
 from ros2_memory.analysis.topic_events import TopicEvents, joined_visible
-from ros2_memory.core.arrays import pair_counts
+from ros2_memory.core.arrays import numbered, pair_counts
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.spans import united
@@ -36,9 +37,10 @@ from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.scan import blocks, read_until_late, scan
 from ros2_memory.results import Bins
+from ros2_memory.things.labels import Labels
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.arrays import Flags
@@ -63,13 +65,15 @@ class SeenLabels(NamedTuple):
     """When labels were in view, and how many of them were seen at once.
 
     Attributes:
-        visible: the intervals in which each label was in view.
-        most_at_once: for each label, the most detections of it in one message.
+        visible: the intervals in which each label was in view, by its key.
+        names: for each key, the label to show.
+        most_at_once: for each key, the most detections of it in one message.
         most_of_all: the most detections of all these labels in one message.
         since: log time after which everything was read, if time ran out; else None.
     """
 
     visible: IntervalTable
+    names: Mapping[str, str]
     most_at_once: Counter[str]
     most_of_all: int
     since: Ns | None
@@ -83,10 +87,14 @@ class _TopicBlock(NamedTuple):
 
 
 class _SeenBlock(NamedTuple):
-    """What was in view in a block. See `SeenLabels`; `source` names its topic and window."""
+    """What was in view in a block. See `SeenLabels`.
+
+    `source` names its topic and window; `spellings` counts the detections of each label.
+    """
 
     source: str
     events: TopicEvents
+    spellings: Counter[str]
     most_at_once: Counter[str]
     most_of_all: int
 
@@ -188,8 +196,8 @@ def _label_rows(seen: SeenLabels, elapsed: Elapsed) -> list[tuple[str, _LabelRow
     for interval in seen.visible.intervals():
         intervals_of[interval.label].append(interval)
     rows = [
-        (named(label), _row(intervals, elapsed, seen.most_at_once[label]))
-        for label, intervals in intervals_of.items()
+        (named(seen.names[key]), _row(intervals, elapsed, seen.most_at_once[key]))
+        for key, intervals in intervals_of.items()
     ]
     return sorted(rows, key=lambda named_row: (-named_row[1].occurrences, named_row[0]))
 
@@ -234,15 +242,19 @@ def read_labels(
             counts &= np.array(holds[::-1], np.bool_)[detections.rows]
         return counts
 
-    newest_first = _seen_blocks(view, topics, scope, counting)
+    key_of = Labels(view.limits.labels).key
+    newest_first = _seen_blocks(view, topics, scope, counting, key_of)
     seen_blocks, since = read_until_late(view, newest_first, READING_S)
     parts: defaultdict[str, list[TopicEvents]] = defaultdict(list)
-    most_at_once = Counter[str]()
+    most_at_once, spellings = Counter[str](), Counter[str]()
     for block in seen_blocks:
         parts[block.source].append(block.events)
         most_at_once |= block.most_at_once
+        spellings += block.spellings
     return SeenLabels(
         united_tables([joined_visible(newest[::-1]) for newest in parts.values()]),
+        # Of a key the last one stays, the most frequent.
+        {key_of(word): word for _, word in sorted((n, word) for word, n in spellings.items())},
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,
@@ -250,7 +262,11 @@ def read_labels(
 
 
 def _seen_blocks(
-    view: View, topics: Sequence[str], scope: Scope, counting: Callable[[Detected], Flags]
+    view: View,
+    topics: Sequence[str],
+    scope: Scope,
+    counting: Callable[[Detected], Flags],
+    key_of: Callable[[str], str],
 ) -> Iterator[tuple[Ns, _SeenBlock]]:
     """Yields what was in view in each block, newest first, and a log time.
 
@@ -262,7 +278,8 @@ def _seen_blocks(
         for topic, detected in newest_first:
             # Blocks of different topics may overlap.
             reached = detected.log_times[0 if len(topics) == 1 else -1]
-            yield int(reached), _seen_in_block(f"{nth} {topic}", detected, counting(detected))
+            counts = counting(detected)
+            yield int(reached), _seen_in_block(f"{nth} {topic}", detected, counts, key_of)
 
 
 def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_TopicBlock]:
@@ -278,18 +295,27 @@ def _topic_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Topic
         view.notes.add_lack(Note(_UNDECODED, topic, str(left_out)))
 
 
-def _seen_in_block(source: str, detected: Detected, counts: Flags) -> _SeenBlock:
+def _seen_in_block(
+    source: str, detected: Detected, counts: Flags, key_of: Callable[[str], str]
+) -> _SeenBlock:
     """Returns when labels were in view in a block, by the detections that count."""
     times, detections = detected.log_times, detected.found
-    labels = detections.labels.words
-    rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+    words = detections.labels.words
+    rows, written = detections.rows[counts], detections.labels.codes[counts]
+    keys, key_codes = numbered(map(key_of, words))
+    codes = key_codes[written]
     _, code_of_pair, sizes = pair_counts(rows, codes).T
-    most_of_codes = np.zeros(len(labels), np.int64)
+    most_of_codes = np.zeros(len(keys), np.int64)
     np.maximum.at(most_of_codes, code_of_pair, sizes)
-    visible = visible_in(times, rows, codes, detections.scores[counts], labels)
+    spellings = np.bincount(written, minlength=len(words)).tolist()
     return _SeenBlock(
         source,
-        TopicEvents(int(times[0]), int(times[-1]), visible),
-        Counter(dict(zip(labels, most_of_codes.tolist(), strict=True))),
+        TopicEvents(
+            int(times[0]),
+            int(times[-1]),
+            visible_in(times, rows, codes, detections.scores[counts], keys),
+        ),
+        Counter(dict(zip(words, spellings, strict=True))),
+        Counter(dict(zip(keys, most_of_codes.tolist(), strict=True))),
         int(np.bincount(rows).max(initial=0)),
     )
