@@ -371,6 +371,22 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     return tuple(texts)
 
 
+def texts_beside(condition: Condition, value: JsonValue) -> tuple[str, ...]:
+    """Returns what the objects are called, and say, whose field meets a condition, each once.
+
+    That is what `above` 30 finds in a log, or in one of several nodes of diagnostics.
+    """
+    holder, _, key = (condition.field or "").rpartition(".")
+    on_key = replace(condition, field=key or None)
+    texts: dict[str, None] = {}
+    for found in at_field(value, holder) if holder else [value]:
+        for one in found if isinstance(found, list) else [found]:
+            if isinstance(one, dict) and on_key.matches(one):
+                said = (one.get(name) for name in ("name", "msg", "message"))
+                texts.update(dict.fromkeys(text for text in said if text and isinstance(text, str)))
+    return tuple(texts)
+
+
 def parse_condition(
     condition_type: str,
     value: JsonValue,

@@ -20,8 +20,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
-from ros2_memory.analysis.facts import LOG
+from ros2_memory.analysis.conditions import (
+    Condition,
+    NearPosition,
+    matched_texts,
+    texts_beside,
+)
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import FLICKER_NS
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -589,9 +593,8 @@ def _sighting(
     if robot is None and robot_at_first:
         # A recording may begin with the match, and have its first pose only after it.
         robot, robot_at_first = robot_at(view, run.last, newest_recording, frame_id), False
-    texts = matched_texts(condition.of_type(newest.type, view.extractor), value)
-    if not texts and newest.type == LOG:
-        texts = tuple(str(text) for path, text in leaves(value) if path in {"name", "msg"})
+    on_type = condition.of_type(newest.type, view.extractor)
+    texts = matched_texts(on_type, value) or texts_beside(on_type, value)
     until, ended = run.last, True
     if thing is None:
         until = _lasted_until(view, condition, run, scope)

@@ -530,6 +530,8 @@ def test_diagnostics_of_one_node_go_on_while_others_report(
     assert sightings("contains", value="blocked") == [(20.0, 20.0, 20)]
     worse = {"field": "status.level", "value": 0}
     assert sightings("above", **worse) == [(30.5, 20.0, 20), (20.0, 20.0, 20)]
+    found = ask("find_matches", condition_type="above", **worse)["sightings"]
+    assert [each["matched"] for each in found] == [["lidar", "dusty"], ["door", "blocked"]]
     [[_, _, _, times, seconds, *_]] = ask(
         "find_matches", condition_type="above", **worse, by="day"
     )["rows"]
