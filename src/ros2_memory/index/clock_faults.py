@@ -222,55 +222,51 @@ def check_dates(
         unset = []  # a simulated clock, or a robot that has none
     if now < FIRST_BAGS_NS and any(segment.latest >= FIRST_BAGS_NS for segment in segments):
         note = "the clock of this machine is not set: bags are dated years after now"
-    faults = [*unset, *ahead, *(fault for fault, _ in set_ahead.values())]
+    faults = [*unset, *ahead, *set_ahead.values()]
     faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
     if len({fault.bag.file for fault in faults if fault.leaves_out_bag}) == total:
         faults = [fault._replace(misleads=False) for fault in faults]
     dated = dated_segments(timeline, faults)
     return Dating(
-        earliest=_first_dated(dated, {file: end for file, (_, end) in set_ahead.items()}),
+        earliest=_first_dated(dated, set_ahead),
         latest=max((segment.latest for segment in dated), default=None),
         faults=tuple(faults),
         note=note,
     )
 
 
-def _set_ahead(timeline: Timeline, limit: Ns) -> dict[str, tuple[ClockFault, Ns]]:
+def _set_ahead(timeline: Timeline, limit: Ns) -> dict[str, ClockFault]:
     """Returns by file the bags from before the clock was set far ahead during their recording.
 
-    Each comes with the first log time after that, if it has any, else that of its last message.
     `limit` is the latest plausible date.
     """
-    within = {
-        bag: span
+    within = [
+        ClockFault(bag, FaultyClock.SET_AHEAD, end - start, until=start)
         for segment in timeline.recorded_segments
-        for bag, span in segment.set_ahead
-        if span[1] >= FIRST_BAGS_NS and bag.end <= limit
-    }
-    found = {
-        bag.file: (ClockFault(bag, FaultyClock.SET_AHEAD, end - start, until=start), end)
-        for bag, (start, end) in within.items()
-    }
-    lengths = {bag: end - start for bag, (start, end) in within.items()}
-    whole = splits_before_set_ahead(timeline, lengths, FAR_AHEAD_NS)
-    for bag, by in whole.items():
-        if FIRST_BAGS_NS <= bag.end + by <= limit:
-            found[bag.file] = ClockFault(bag, FaultyClock.SET_AHEAD, by), bag.end
-    return found
+        for bag, (start, end) in segment.set_ahead
+        if end >= FIRST_BAGS_NS and bag.end <= limit
+    ]
+    lengths = {fault.bag: fault.by for fault in within}
+    whole = [
+        ClockFault(bag, FaultyClock.SET_AHEAD, by)
+        for bag, by in splits_before_set_ahead(timeline, lengths, FAR_AHEAD_NS).items()
+        if FIRST_BAGS_NS <= bag.end + by <= limit
+    ]
+    return {fault.bag.file: fault for fault in (*within, *whole)}
 
 
-def _first_dated(dated: Sequence[Segment], set_ahead: Mapping[str, Ns]) -> Ns | None:
+def _first_dated(dated: Sequence[Segment], set_ahead: Mapping[str, ClockFault]) -> Ns | None:
     """Returns the first log time of correctly dated bags; None without any.
 
-    `set_ahead` has by file the first log time after the clock was set.
+    Those in `set_ahead` count from when the clock was set.
     """
-    if not set_ahead:
-        return dated[0].first[0] if dated else None
     firsts: list[Ns] = []
     for bag in chain.from_iterable(segment.bags for segment in dated):
-        firsts.append(set_ahead.get(bag.file, bag.start))
-        if bag.file not in set_ahead:
+        fault = set_ahead.get(bag.file)
+        if fault is None or fault.until is None:
+            firsts.append(bag.start)
             break
+        firsts.append(fault.until + fault.by)
     return min(firsts, default=None)
 
 

@@ -31,13 +31,14 @@ written, and a read meanwhile would find them in contradiction.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
 from ros2_memory.bag_dir.state_files import Withheld, read_withheld
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
@@ -46,6 +47,8 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader
 
@@ -112,7 +115,7 @@ class ScanContext:
     open_recordings: frozenset[str] | None = None
     include_active: bool = False
     trusts_mtime: bool = True
-    _listed: dict[Path, frozenset[str]] = field(default_factory=dict)
+    _listed: dict[Path, Collection[str]] = field(default_factory=dict)
 
     @property
     def settling_ns(self) -> Ns:
@@ -136,7 +139,9 @@ class ScanContext:
         """Returns whether the metadata.yaml beside a file lists it."""
         folder = path.parent
         if folder not in self._listed:
-            self._listed[folder] = files_in_metadata(folder / "metadata.yaml")
+            self._listed[folder] = ()
+            with suppress(OSError, ValueError):
+                self._listed[folder] = read_listing(folder / METADATA_FILE).names
         return path.name in self._listed[folder]
 
 
@@ -260,14 +265,6 @@ def reason_unread(path: Path) -> str:
     if not path.name.endswith(kind):
         return f"the name of a bag file must end in {kind}, in lower case: rename it"
     return f"this storage does not read {kind} files: choose storage=rosbag2, which does"
-
-
-def files_in_metadata(path: Path) -> frozenset[str]:
-    """Returns the bag files that a metadata.yaml lists; none if it cannot be read."""
-    try:
-        return frozenset(read_listing(path).names)
-    except (OSError, ValueError):
-        return frozenset()
 
 
 def _is_active(notes: FileNotes, context: ScanContext) -> bool:

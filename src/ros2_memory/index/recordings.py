@@ -19,12 +19,10 @@ from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.index.split_order import split_of, stem_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile
-    from ros2_memory.index.bag_rows import BagRows
-    from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
 BAG_DIR_ITSELF: Final = "."
@@ -54,24 +52,13 @@ def recordings_of(
     The key is the path of the recording: a folder, or a bag without its suffix. `data.recording`
     takes this path, relative to the bag directory.
     """
-    recordings: dict[str, list[BagFile]] = {}
-    for bags, paths in _with_recordings(snapshot, snapshot.timeline.recorded_segments):
-        rows = np.flatnonzero(bags.with_schema(is_wanted))
-        for row, bag in zip(rows.tolist(), bags.at(rows), strict=True):
-            recordings.setdefault(paths[row], []).append(bag)
-    return recordings
-
-
-def _with_recordings(
-    snapshot: Snapshot, segments: Iterable[Segment]
-) -> Iterator[tuple[BagRows, Sequence[str]]]:
-    """Yields the bags of each segment, and for each bag the path of its recording."""
     loose = loose_bags(snapshot)
-    for bags in (segment.bags for segment in segments):
-        paths = [bags.folders[nth] for nth in bags.folder_of.tolist()]
-        if loose:
-            paths = [*map(loose.get, bags.files(), paths)]
-        yield bags, paths
+    recordings: dict[str, list[BagFile]] = {}
+    for bags in (segment.bags for segment in snapshot.timeline.recorded_segments):
+        for bag in bags.at(bags.with_schema(is_wanted)):
+            path = loose.get(bag.file) or bag.file.rpartition("/")[0]
+            recordings.setdefault(path, []).append(bag)
+    return recordings
 
 
 def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:

@@ -28,7 +28,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.file_state import files_in_metadata
+from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.serving.mcp_server import EpisodicServer
@@ -106,7 +106,7 @@ def outside(tmp_path: Path) -> Path:
     secret = [text(T0 + n * NS_PER_S, f"secret {n}", SECRET) for n in range(5)]
     write_mcap(folder / "rec_0.mcap", secret)
     write_db3(folder / "rec_1.db3", secret)
-    (folder / "metadata.yaml").write_text("relative_file_paths: [rec_0.mcap]\n")
+    (folder / "metadata.yaml").write_text("relative_file_paths:\n- rec_0.mcap\n")
     return folder
 
 
@@ -303,7 +303,7 @@ def test_no_sidecar_is_read_or_written_through_a_link(bags: Path, outside: Path)
     (bags / "run/metadata.yaml").symlink_to(kept)
     assert "symbolic links" in (read_handover(bags / "run").problem or "")
     assert read_heartbeat(bags).heartbeat is None
-    assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
+    assert not ScanContext(bags, 0, 0).lists(bags / "run/rec_0.mcap")
     with untouched(outside):
         (bags / "recorder.json").unlink()
         (bags / ".recorder.json.tmp").symlink_to(kept)

@@ -18,6 +18,7 @@ from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.scan import ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
@@ -361,7 +362,8 @@ def test_there_are_no_notes_on_closed_bags_even_if_the_clock_is_not_set_yet(
     """A robot without a battery-backed clock starts in 1970, with a week of bags."""
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(NOW - 7200 * S, 0.0, 0.0)])
     os.utime(path, ns=(LONG_AGO, LONG_AGO))
-    index = memory_of(tmp_path, clock=SettableClock(now)).index
+    clock = SettableClock(now)
+    index = IndexManager(tmp_path, McapReader(), clock, refresh_s=0.0, split_duration_s=10.0)
     with index.undisturbed() as snapshot:
         assert [bag.path for bag in snapshot.bags] == [path]
         assert not index.known_bags((), snapshot).files
