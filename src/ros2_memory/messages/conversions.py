@@ -43,7 +43,7 @@ INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 _INDEX_IN_BRACKETS: Final = re.compile(r"\[(-?\d{1,9})\]")
 _BETWEEN_SEGMENTS: Final = re.compile(r"\.(?![^\[\]]*\])|(?<=[^.])(?=\[\w+=)")
 """A dot that is not in brackets, or where a selector begins."""
-_SELECTOR: Final = re.compile(r"\[(\w+)=([^\]]*)\]")
+_SELECTOR: Final = re.compile(r"""\[(\w+)=(["']?)([^\]]*)\2\]""")
 
 Segments: TypeAlias = tuple[str, ...]
 
@@ -167,7 +167,7 @@ class Selector(NamedTuple):
         """Returns the selector that a segment is; None for any other segment."""
         # Nearly all segments are names: they are not matched.
         found = _SELECTOR.fullmatch(segment) if segment.startswith("[") else None
-        return None if found is None else cls(*found.groups())
+        return None if found is None else cls(found[1], found[3])
 
     def accepts(self, value: object) -> bool:
         """Returns whether a value is the wanted text, number or boolean, or has its name."""
@@ -191,7 +191,7 @@ def parse_path(path: str) -> Segments | None:
 def descend(
     node: object, segments: Sequence[str], step: Callable[[object, str], object] = field_of
 ) -> object:
-    """Returns what is at a path: None below a null or past the end of a list, else ABSENT.
+    """Returns what is at a path: None below a null or past the ends of a list, else ABSENT.
 
     A name after a list is looked up in each element: the result is a list with None for elements
     that lack it, and ABSENT if all of them do. A selector leads to the element itself, to None or
@@ -199,7 +199,7 @@ def descend(
 
     Args:
         node: a message, a JSON value or a part of one.
-        segments: of the path; a whole number is an index, `[name=left]` a `Selector`.
+        segments: of the path; a whole number is an index (`INDEX`), `[name=left]` a `Selector`.
         step: returns the field of a node, or ABSENT.
     """
     for at, segment in enumerate(segments):
@@ -207,10 +207,9 @@ def descend(
             return node
         if not isinstance(node, list | tuple | np.ndarray):
             node = step(node, segment)
-        elif segment.isascii() and segment.isdecimal():
-            # An index of ten digits or more is past the end of any list.
-            index = int(segment) if len(segment) < 10 else len(node)
-            node = node[index] if index < len(node) else None
+        elif INDEX.fullmatch(segment):
+            index = int(segment)
+            node = node[index] if -len(node) <= index < len(node) else None
         elif selector := Selector.of(segment):
             chosen = [part for part in node if selector.accepts(step(part, selector.field))]
             node = chosen[0] if len(chosen) == 1 else chosen or None

@@ -51,7 +51,8 @@ def spans(memory: Memory, topic: str, **condition: Any) -> list[tuple[int, int]]
 def test_a_condition_is_tested_on_the_selected_element_alone(memory: Memory) -> None:
     warns = {"condition_type": "above", "value": 0}
     assert spans(memory, "/diagnostics", field="status[name=left].level", **warns) == [(30, 49)]
-    assert spans(memory, "/diagnostics", field="status[name=right].level", **warns) == [(10, 89)]
+    for right in ("status[name=right].level", "status[name='right'].level", "status[-1].level"):
+        assert spans(memory, "/diagnostics", field=right, **warns) == [(10, 89)]
     assert spans(memory, "/diagnostics", field="status.level", **warns) == [(10, 89)]
     error = {"condition_type": "equals", "value": "left"}
     assert spans(memory, "/diagnostics", field="status[level=2].name", **error) == [(30, 49)]
@@ -72,6 +73,13 @@ def test_fields_show_the_selected_elements(memory: Memory) -> None:
     given = {"timestamp": T0_S + 40, "fields": ["status[name=left].level", "status[level=1].name"]}
     reply = asked(memory, "get_topic_at_time", topic="/diagnostics", **given)
     assert [*reply["value"].values()] == [2, "right"]
+    given["fields"] = ["status[-1].level", "status[name='left'].level", "status[-3].level"]
+    reply = asked(memory, "get_topic_at_time", topic="/diagnostics", **given)
+    assert [*reply["value"].values()] == [1, 2, None]
+    given["fields"] = ["data.items[-1].name", 'data.items[name="bread"].stock']
+    reply = asked(memory, "get_topic_at_time", topic="/shelf", **given)
+    assert [*reply["value"].values()] == ["bread", 7]
+    assert "notes" not in reply
     stock = ["data.items[name=oat milk].stock"]
     by_hour = asked(memory, "get_topic_in_range", topic="/shelf", fields=stock, by="hour", **RIGHT)
     [row] = by_hour["rows"]
