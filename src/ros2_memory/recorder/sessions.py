@@ -415,6 +415,11 @@ class RecordingSessions:
         """The bytes that all recordings wrote since the start."""
         return self._ended_bytes + sum(session.splits.bytes_written for session in self.running)
 
+    @property
+    def subscribed(self) -> set[str]:
+        """The topics that any running child has subscribed to."""
+        return set[str]().union(*(session.subscribed for session in self.running))
+
     def begin(self, now: ClockReading) -> None:
         """Starts a recording; none may be current.
 

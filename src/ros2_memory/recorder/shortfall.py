@@ -80,8 +80,9 @@ class TopicWatch:
     def missing(self) -> tuple[str, ...]:
         """Returns the topics that no publisher has offered; none before a child records."""
         running = self._sessions.running
-        for session in running:
-            self._offered |= session.subscribed | session.splits.received
+        self._offered |= self._sessions.subscribed.union(
+            *(each.splits.received for each in running)
+        )
         if not any(session.has_recorded for session in running):
             return ()
         unknown = (session.of_unknown_type for session in running)
@@ -164,7 +165,7 @@ class TopicWatch:
         sessions, now_s = self._sessions, now.monotonic_s
         if self._began_s is None:
             self._began_s = now_s
-        offered = set[str]().union(*(session.subscribed for session in sessions.running))
+        offered = sessions.subscribed
         unknown = current.refused_types(now)
         if len(sessions.running) > 1 or current.age_s(now) < TYPES_S:
             # A new recording has not discovered all topics yet.

@@ -107,6 +107,7 @@ class Supervisor:
         self._beat: Heartbeat | None = None
         self._backoff = {"restart": Backoff(), "rotate": Backoff()}
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
+        self._watched = ""  # the recording of `_silence`
         self._rotating_for_silence = False
         self._paused = False
         self._room_requested = False
@@ -243,15 +244,11 @@ class Supervisor:
             self._events.info("disk_back", bag_dir=str(self._bag_dir))
 
     def _check_exits(self, now: ClockReading) -> None:
-        before = self._sessions.current
         for _ in range(self._sessions.collect_ended(now)):
             self._put_off("rotate", now)
             self._put_off("restart", now)
         if self._sessions.end_unready(now):
             self._put_off("restart", now)
-        current = self._sessions.current
-        if current is not None and current is not before:
-            self._silence.note_begin(now.monotonic_s)
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes bags, pauses or resumes recording, by the free space on the disk."""
@@ -295,7 +292,6 @@ class Supervisor:
         if step is Step.COMPLETE:
             self._backoff["rotate"].reset()
             self._silence.note_rotation(for_silence=self._rotating_for_silence)
-            self._silence.note_begin(now.monotonic_s)
         elif step is Step.ABANDON:
             self._put_off("rotate", now)
 
@@ -303,6 +299,9 @@ class Supervisor:
         current = self._sessions.current
         if current is None:
             return
+        if current.name != self._watched:
+            self._watched = current.name
+            self._silence.note_begin(now.monotonic_s)
         is_silent = self._silence.is_silent(
             now.monotonic_s,
             current.splits.bytes_written,
@@ -368,7 +367,6 @@ class Supervisor:
             self._events.fail("recorder_not_started", str(error))
             raise
         self._topic_watch.note_begin(now)
-        self._silence.note_begin(now.monotonic_s)
 
     def _note_recorded(self, now: ClockReading) -> None:
         names = [session.name for session in self._sessions.running if session.has_recorded]
@@ -438,7 +436,6 @@ class Supervisor:
         """Returns the heartbeat of this moment."""
         sessions, watch, events = self._sessions, self._topic_watch, self._events
         names = dict.fromkeys(filter(None, (*self._names(), announced)))
-        subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
         silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
         return Heartbeat(
             pid=os.getpid(),
@@ -447,7 +444,7 @@ class Supervisor:
             recordings=tuple(names),
             since=since,
             bytes_written=sessions.bytes_written,
-            subscribed=tuple(sorted(subscribed)),
+            subscribed=tuple(sorted(sessions.subscribed)),
             silent=tuple(sorted(silent | watch.gone)),
             last_error=events.last_error,
             last_error_at=events.last_error_at,
