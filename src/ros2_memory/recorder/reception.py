@@ -1,7 +1,7 @@
 """Measures how topics arrive, plans their QoS, and decides when that needs a new recording.
 
-`ros2 bag record` never changes a subscription. So a deeper queue, or a weaker QoS for a publisher
-that came later, takes a rotation. Splits are measured in the background.
+`ros2 bag record` never changes a subscription. So a deeper queue, or a weaker QoS or another type
+for a publisher that came later, takes a rotation. Splits are measured in the background.
 """
 
 from __future__ import annotations
@@ -129,6 +129,7 @@ class _Recording:
 
     Attributes:
         refused: topics with a publisher that the subscription does not fit.
+        of_types: topics with a publisher of another type during the newest split.
         asked_anew: topics whose subscription fits every publisher.
         span: the first and the last log time (ns); None before the first split.
         newest: the same of its newest split, and of the seconds before that.
@@ -137,6 +138,7 @@ class _Recording:
     plan: QueuePlan
     asked_anew: frozenset[str]
     refused: set[str] = field(default_factory=set)
+    of_types: Collection[str] = ()
     span: Span | None = None
     newest: Span | None = None
 
@@ -250,12 +252,12 @@ class Reception:
         for path in paths:
             self._measure("", path)
 
-    def learn(self, recording: str, path: Path, unreceived: Collection[str] = ()) -> None:
+    def learn(self, recording: str, path: Path, of_types: Collection[str] = ()) -> None:
         """Measures a closed split of a recording in the background.
 
-        `unreceived`: topics of which some publisher was not received meanwhile, for its type.
+        `of_types`: topics of which some publisher was not received meanwhile, for its type.
         """
-        self.background.add(_TASK, lambda: self._measure(recording, path, unreceived))
+        self.background.add(_TASK, lambda: self._measure(recording, path, of_types))
 
     def flush(self) -> None:
         """Counts the losses that only a further split could disprove: recording has ended."""
@@ -344,16 +346,19 @@ class Reception:
             state = self._recordings.get(recording)
             if state is None:
                 return None
+            weak = state.refused & self._asked_anew.keys()
+            # The publisher of the type that was subscribed to has gone.
+            gone = state.of_types and self._arrivals.silent_topics(0).intersection(state.of_types)
             refused = [
                 topic
-                for topic in sorted(state.refused & self._asked_anew.keys())
-                if topic not in state.asked_anew
+                for topic in sorted(weak.union(gone))
+                if topic in weak - state.asked_anew
                 or now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
             ]
             if refused:
                 sentence = (
-                    f"a publisher offers weaker QoS than requested on {listed(refused)}: a "
-                    "new recording subscribes again; messages sent by it meanwhile are not recorded"
+                    f"the QoS or type of a publisher of {listed(refused)} does not fit: a new "
+                    "recording subscribes again; messages sent by it meanwhile are not recorded"
                 )
                 return Rotation("asking_again", sentence, frozenset(refused), is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
@@ -388,7 +393,7 @@ class Reception:
     def _plan_queues(self) -> QueuePlan:
         return plan_queues(self._flows_with_depth(), self.queue_bytes)
 
-    def _measure(self, recording: str, path: Path, unreceived: Collection[str] = ()) -> None:
+    def _measure(self, recording: str, path: Path, of_types: Collection[str] = ()) -> None:
         """Measures a split; without a recording it is of an earlier run."""
         try:
             split = measure_split(self.reader, path, end_only=not recording)
@@ -402,7 +407,10 @@ class Reception:
         with self._lock:
             before = self._plan_queues().cut_short
             state = self._recordings.get(recording)
-            refused = {*unreceived} if state is None else state.refused.union(unreceived)
+            refused = {*of_types}
+            if state is not None:
+                state.of_types = of_types
+                refused |= state.refused
             self._add_flows(split, refused)
             short = self._plan_queues().cut_short - before
             self._losses.forget(split.arrivals.keys() - split.progress.keys())

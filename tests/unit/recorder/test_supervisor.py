@@ -371,6 +371,25 @@ def test_while_publishers_disagree_on_a_type_messages_are_missing_and_not_later(
     assert over - 6 * NS_PER_S < last < over + 6 * NS_PER_S
 
 
+def test_a_topic_whose_publishers_have_another_type_now_is_subscribed_to_again(
+    tmp_path: Path,
+) -> None:
+    """A new recording does so: only the old one's subscription has the type of before."""
+    world = World(tmp_path)
+    world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
+    world.started(60)
+    [old] = world.running
+    old.heard = ("/bumper",)
+    with capture_logs() as logs:
+        for _ in range(80):
+            if old.status is None:
+                old.lines.append(SEVERAL_TYPES.format("/door"))
+            world.run(0.5)
+        world.run(300)
+    assert [len(events(logs, name)) for name in ("asking_again", "rotated")] == [1, 1]
+    assert world.heartbeat()["fell_silent"] == []
+
+
 def test_a_heartbeat_that_cannot_be_written_is_reported_once_and_recording_goes_on(
     world: World,
 ) -> None:
