@@ -12,6 +12,7 @@ the time. It was if its messages follow each other at the detector's usual rate:
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,7 +21,6 @@ from ros2_memory.core.arrays import (
     Flags,
     Ints,
     joined_codes,
-    numbered,
     range_numbers,
     sorted_codes,
     stable_order,
@@ -135,9 +135,7 @@ class IntervalTable(NamedTuple):
     def intervals(self) -> tuple[VisibleInterval, ...]:
         """Returns all intervals as objects."""
         return tuple(
-            VisibleInterval(
-                self.labels[label], first, last, None if best == _NO_SCORE else best / _SCORES
-            )
+            VisibleInterval(self.labels[label], first, last, _shown_score(best))
             for first, last, label, *_, best in self._array.tolist()
         )
 
@@ -167,19 +165,49 @@ class IntervalTable(NamedTuple):
         _, longest = np.unique(self._array["label"][by_length], return_index=True)
         return self._select(np.sort(by_length[longest]))
 
-    def seen_once(self, key_of: Callable[[str], str], within: Ns) -> IntervalTable:
-        """Returns the intervals of the keys of labels that were seen within one short time alone.
+    def messages(self) -> Counter[str]:
+        """Returns how many messages have each label."""
+        counts = np.bincount(self._array["label"], self._array["count"], len(self.labels))
+        return Counter(dict(zip(self.labels, counts.astype(np.int64).tolist(), strict=True)))
+
+    def relabelled(self, label_of: Callable[[str], str]) -> IntervalTable:
+        """Returns the intervals with other labels; those that overlap then are one."""
+        rows = self._array.copy()
+        rows["label"], labels = sorted_codes(rows["label"], [*map(label_of, self.labels)])
+        return united_tables([IntervalTable(labels, rows.tobytes())])
+
+    def seen_once(self, within: Ns) -> IntervalTable:
+        """Returns the intervals of the labels that were seen within one short time alone.
 
         They have `_FEWEST_ONCE` messages or more: detectors are wrong now and then.
         """
         rows = self._array
-        names, codes = numbered(map(key_of, self.labels))
-        keys = codes[rows["label"]]
-        first, last = np.full(len(names), MAX_NS), np.full(len(names), MIN_NS)
-        np.minimum.at(first, keys, rows["first"])
-        np.maximum.at(last, keys, rows["last"])
+        labels = rows["label"]
+        first, last = np.full(len(self.labels), MAX_NS), np.full(len(self.labels), MIN_NS)
+        np.minimum.at(first, labels, rows["first"])
+        np.maximum.at(last, labels, rows["last"])
         is_once = first + within >= last
-        return self._select(is_once[keys] & (rows["count"] >= _FEWEST_ONCE))
+        return self._select(is_once[labels] & (rows["count"] >= _FEWEST_ONCE))
+
+    def of_each_label(self) -> list[tuple[VisibleInterval, int, Ns]]:
+        """Returns for each label the time from first to last, how many intervals, and their length.
+
+        Intervals of fewer than `_FEWEST_ONCE` messages do not count.
+        """
+        steady = self._select(self._array["count"] >= _FEWEST_ONCE)
+        best = np.full(len(self.labels), _NO_SCORE)
+        np.maximum.at(best, steady._array["label"], steady._array["best"])
+        return [
+            (
+                VisibleInterval(label, int(first[0]), int(last.max()), _shown_score(score)),
+                first.size,
+                int((last - first).sum()),
+            )
+            for (label, (first, last)), score in zip(
+                steady.spans().items(), best.tolist(), strict=True
+            )
+            if first.size
+        ]
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """Returns the labels seen at their usual rate all the time from `start` to `end`."""
@@ -270,6 +298,10 @@ def _stored_scores(scores: NDArray[np.float64]) -> Ints:
     with np.errstate(invalid="ignore"):
         stored = np.rint(np.clip(scores, -most / _SCORES, most / _SCORES) * _SCORES)
     return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
+
+
+def _shown_score(stored: int) -> float | None:
+    return None if stored == _NO_SCORE else stored / _SCORES
 
 
 def united_tables(

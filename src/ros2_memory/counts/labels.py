@@ -242,8 +242,8 @@ def read_labels(
             counts &= np.array(holds[::-1], np.bool_)[detections.rows]
         return counts
 
-    key_of = Labels(view.limits.labels).key
-    newest_first = _seen_blocks(view, topics, scope, counting, key_of)
+    labels = Labels(view.limits.labels)
+    newest_first = _seen_blocks(view, topics, scope, counting, labels.key)
     seen_blocks, since = read_until_late(view, newest_first, READING_S)
     parts: defaultdict[str, list[TopicEvents]] = defaultdict(list)
     most_at_once, spellings = Counter[str](), Counter[str]()
@@ -253,8 +253,7 @@ def read_labels(
         spellings += block.spellings
     return SeenLabels(
         united_tables([joined_visible(newest[::-1]) for newest in parts.values()]),
-        # Of a key the last one stays, the most frequent.
-        {key_of(word): word for _, word in sorted((n, word) for word, n in spellings.items())},
+        labels.most_frequent(spellings),
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,

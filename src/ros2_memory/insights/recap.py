@@ -257,7 +257,7 @@ def _what_happened(
     events = [
         *_stop_events(nsmallest(most, stops, key=lambda stop: -stop.length), places),
         *_reported_events(view, window, topics, region_stays),
-        *dict.fromkeys([*things.events, *things.rare]),
+        *things.events,
         *_recording_events(view, window, drive),
         *(_goal_event(goal, start, drive.elapsed) for goal in goals),
     ]
@@ -475,8 +475,8 @@ class _ThingsInView(NamedTuple):
     """Things that came into view or left it.
 
     Attributes:
-        events: the things that were seen longest.
-        rare: the longest of those that were seen once in a long record.
+        events: the things that were seen.
+        rare: those among them that were seen once in a long record.
         total: how many there are.
         throughout: the labels that were seen throughout the window.
         longest_of_each: the longest sight of each other label, in order of time.
@@ -500,7 +500,8 @@ def _things_in_view(
 ) -> _ThingsInView:
     """Returns the things that were seen, with events of at most `most`, and of as many labels.
 
-    In a region nothing counts as seen throughout. A note says how many scores are too low.
+    Of more sights than that each label has one event. In a region nothing counts as seen
+    throughout. A note says how many scores are too low.
     """
     start, end = window.asked()
     newest = view.snapshot.latest
@@ -509,9 +510,11 @@ def _things_in_view(
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
+    label_of = _shown_labels(view, [events.visible for events in events_of_topics.values()])
     for topic_events in events_of_topics.values():
-        visible = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
-        below += topic_events.visible.size - visible.size
+        every = topic_events.visible.relabelled(label_of)
+        visible = every.scoring(min_score) if min_score else every
+        below += every.size - visible.size
         tables.append(visible)
         throughout.update(visible.throughout(start, end))
         for label in visible.at_end(topic_events.last, known_to):
@@ -529,14 +532,27 @@ def _things_in_view(
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
     rare = IntervalTable()
     if region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS:
-        rare = things.seen_once(Labels(view.limits.labels).key, NS_PER_HOUR).longest_of_each()
+        rare = things.seen_once(NS_PER_HOUR).longest_of_each()
+    if things.size <= most:
+        events = [_sight_event(interval, last_seen) for interval in things.longest(most)]
+    else:
+        events = [_sight_event(one, last_seen, *of) for one, *of in things.of_each_label()]
+    rare_labels = [interval.label for interval in rare.longest(_MOST_RARE)]
     return _ThingsInView(
-        [_sight_event(interval, last_seen) for interval in things.longest(most)],
-        [_sight_event(interval, last_seen) for interval in rare.longest(_MOST_RARE)],
+        events,
+        [event for event in events if event.label in rare_labels],
         things.size,
         throughout,
         [_sight_event(interval, last_seen) for interval in longest_of_each],
     )
+
+
+def _shown_labels(view: View, tables: Sequence[IntervalTable]) -> Callable[[str], str]:
+    """Returns what maps each spelling of a label to the most frequent one."""
+    counts = sum((table.messages() for table in tables), Counter[str]())
+    labels = Labels(view.limits.labels)
+    names = labels.most_frequent(counts)
+    return lambda label: names[labels.key(label)]
 
 
 def _recorded_for(view: View, window: TimeWindow) -> Ns:
@@ -545,14 +561,21 @@ def _recorded_for(view: View, window: TimeWindow) -> Ns:
     return last - first - length_in([*recording_gaps(view, window)], first, last)
 
 
-def _sight_event(interval: VisibleInterval, last_seen: Mapping[str, Ns]) -> Event:
-    """Returns a sight of a thing; it goes on if the label was last seen (ns) at its end."""
+def _sight_event(
+    interval: VisibleInterval, last_seen: Mapping[str, Ns], times: int = 1, length: Ns = 0
+) -> Event:
+    """Returns a sight of a thing, or several as one event, which last so long (ns) in all.
+
+    It goes on if the label was last seen (ns) at its end.
+    """
     label = interval.label
+    often = f" ({times} times, {seconds(length)} in all)" if times > 1 else ""
     return Event(
         "thing",
         interval.first,
         interval.last,
-        repeating(f"{label} in view", [label]),
+        repeating(f"{label} in view{often}", [label]),
+        times=times,
         goes_on=interval.last == last_seen.get(label),
         score=interval.best,
         label=label,
@@ -764,7 +787,10 @@ def _most_important(
     if counts.total() == len(events) == most + 1:
         most += 1
     shown = sorted(events, key=rank)[:most]
-    left_out = counts - Counter(event.kind for event in shown)
+    left_out = Counter(counts)
+    for event in shown:
+        left_out[event.kind] -= event.times
+    left_out = +left_out
     if left_out:
         named = [
             counted(left_out[kind], "sight of a thing" if kind == "thing" else kind, several)

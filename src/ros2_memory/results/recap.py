@@ -247,6 +247,7 @@ class Event:
         point: where the robot was (m), in the frame of the recap; None if that is not known.
         topic: whose message it is, of booleans; else empty.
         label: of a thing in view; else empty.
+        times: how many sights of a thing it stands for.
     """
 
     kind: str
@@ -261,6 +262,7 @@ class Event:
     point: tuple[float, float] | None = None
     topic: str = ""
     label: str = ""
+    times: int = 1
 
 
 @result(

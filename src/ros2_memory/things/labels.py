@@ -185,6 +185,12 @@ class Labels:
         plain_key = _key_of(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
+    def most_frequent(self, counts: Mapping[str, int]) -> dict[str, str]:
+        """Returns for each key the label that is written most often; `counts` has each label's."""
+        return {
+            self.key(label): label for _, label in sorted((n, one) for one, n in counts.items())
+        }
+
     def are_apart(self, one: str, other: str) -> bool:
         """Returns whether the owner declared two keys as different things."""
         return one in self._shown and other in self._shown

@@ -303,6 +303,28 @@ def test_of_a_lid_that_is_mostly_closed_the_openings_are_listed_first(tmp_path: 
     assert dict(told.counts) == {"on/off changes": 2 * MOST_EVENTS}
 
 
+@pytest.mark.parametrize(("sights", "is_one"), [(MOST_EVENTS - 1, False), (MOST_EVENTS, True)])
+def test_many_sights_are_one_event_of_each_thing_in_all_its_spellings(
+    tmp_path: Path, sights: int, *, is_one: bool
+) -> None:
+    """A clock is seen for 4 s of every 10, now and then as "Clock"; a ghost in one message."""
+    seen = [
+        detections(BEGIN + at * S, ["Clock" if at % 10 == 2 else "clock"] * (at % 10 < 5))
+        for at in range(10 * sights)
+    ]
+    seen.append(detections(BEGIN + 17 * S + S // 2, ["ghost"]))
+    reply = asked(remembered(tmp_path, in_order(seen)), "recap", start=T0, end=T0 + 10 * sights)
+    texts = [event["text"] for event in reply["events"]]
+    assert reply["counts"] == {"sightings": sights + 1}
+    if is_one:
+        assert texts == [f"clock in view ({sights} times, {4 * sights} s in all)"]
+        assert "left out, because there are too many: 1 sight of a thing;" in str(reply["notes"])
+        [event] = reply["events"]
+        assert (event["timestamp"], event["duration_s"]) == (T0, 10 * sights - 6)
+    else:
+        assert sorted(texts) == ["clock in view"] * sights + ["ghost in view"]
+
+
 @pytest.mark.parametrize(("hours", "is_listed"), [(60, True), (40, False)])
 def test_a_thing_that_was_seen_once_in_days_is_listed_beside_what_happens_all_the_time(
     tmp_path: Path, hours: int, is_listed: bool
