@@ -433,6 +433,7 @@ def _newest_placed(
     """Returns the newest message whose pose can be placed in `frame_id`, and its pose there.
 
     A map is corrected more rarely than poses come: transforms may not lead there from the newest.
+    Unless the tolerance was given, a pose of the time since a usual correction will do.
 
     Raises:
         NoDataError: none within the tolerance can be placed; it names the tolerance that suffices.
@@ -444,7 +445,7 @@ def _newest_placed(
         older = _last_placed(asked.view, newest.topic, TimeWindow(start, newest.time), frame_id)
         if older is None:
             raise
-        if older[0].time < asked.window.start:
+        if asked.is_strict and older[0].time < asked.window.start:
             detail = f"{error.detail}; or, {accepting(older[0], asked.at)}"
             raise NoDataError(error.reason, detail, error.notes) from error
         return older
