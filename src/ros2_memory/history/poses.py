@@ -130,16 +130,15 @@ class PoseReader:
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the block of rows that overlap in time, in the order of `blocks`."""
         first, last = min(part.first for part in rows), max(part.last for part in rows)
-        all_count = not any(map(self._overruling, rows))
+        all_count = not any(map(self.overruling, rows))
         return PoseRows(first, last, partial(self._joined, rows), rows if all_count else ())
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        counting = map(self._counting, rows)
-        return joined_poses([self.poses(part) for part in counting if len(part)])
+        return joined_poses([*map(self.poses, rows)])
 
     def _counting(self, rows: Rows) -> Rows:
         """Returns the rows without those at whose time another recording counts."""
-        for pair in self._overruling(rows):
+        for pair in self.overruling(rows):
             is_overruled = pair.span.holding(rows.times)
             if pair.bags:
                 is_of_bags = np.zeros(len(rows), np.bool_)
@@ -149,7 +148,7 @@ class PoseReader:
             rows = rows.some(np.flatnonzero(~is_overruled))
         return rows
 
-    def _overruling(self, rows: Rows) -> list[ParallelRecordings]:
+    def overruling(self, rows: Rows) -> list[ParallelRecordings]:
         """Returns the pairs by which another recording counts at times of these rows."""
         return [
             pair
@@ -159,11 +158,14 @@ class PoseReader:
         ]
 
     def poses(self, rows: Rows) -> Poses:
-        """Returns the poses of rows, in order of log time.
+        """Returns the poses of rows, in order of log time, that count.
 
         Raises:
             InvalidArgumentsError: messages carry no position.
         """
+        rows = self._counting(rows)
+        if not len(rows):
+            return joined_poses([])
         try:
             poses = of_columns(self._view, rows, self._read_columns)
         except NoPoseError:

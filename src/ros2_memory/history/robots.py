@@ -471,14 +471,16 @@ def _is_short_edge(earlier: _TopicSpan, later: _TopicSpan) -> bool:
     return is_edge and 2 * (earlier.last - later.first) < shortest
 
 
-def times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
+def times_recorded_twice(
+    view: View, window: TimeWindow, *, within_bags: bool = True
+) -> Iterator[ParallelRecordings]:
     """Yields the recordings in which the clock was set back, with the bags after that.
 
     Within a bag the moment is known only to the period of its fastest topic, and which messages are
     from before it is not known.
     """
     for fault in view.snapshot.dating.faults:
-        if fault.kind is not FaultyClock.SET_BACK:
+        if fault.kind is not FaultyClock.SET_BACK or not (within_bags or fault.before):
             continue
         twice = TimeWindow(fault.at, fault.at + fault.by + 1)
         if fault.before is None:

@@ -51,7 +51,7 @@ from ros2_memory.history.driven_path import (
     note_left_out,
 )
 from ros2_memory.history.poses import PoseReader
-from ros2_memory.history.robots import recordings_apart
+from ros2_memory.history.robots import recordings_apart, times_recorded_twice
 from ros2_memory.history.scan import (
     joined_back,
     open_scan,
@@ -108,7 +108,10 @@ class TrackReader:
             and self._own_frame == frame_id
             and frame_of_oldest_pose(view, view.pose_topic) == frame_id
         )
-        self._reader = PoseReader(view)
+        # Of a time that files have twice, those from before count, as for the path.
+        everything = TimeWindow.everything()
+        self._twice = [*times_recorded_twice(view, everything, within_bags=False)]
+        self._reader = PoseReader(view, self._twice)
 
     def track_in(self, window: TimeWindow) -> KnownTrack:
         """Returns the track in a window, and a little beyond it.
@@ -230,6 +233,8 @@ class TrackReader:
         is_oldest = start == pose_scan.window.start
         if is_oldest or stretch.parts is None or not window.covers(start, last):
             return None
+        if any(pair.span.overlaps(start, last) for pair in self._twice):
+            return None
         span = TimeWindow(start, last + 1)
         recording_of_part = self._moving_parts(moving, span)
         if recording_of_part is None:
@@ -305,7 +310,7 @@ class TrackReader:
         self, rows: Rows, lent_spans: Sequence[_LentSpan], moving: Sequence[Scan]
     ) -> FragmentKey | None:
         """Returns the key under which the track of rows is stored; None if it may still change."""
-        if rows.part is None:
+        if rows.part is None or self._reader.overruling(rows):
             return None
         sessions = self._view.sessions
         parts, placed_by = [rows.part], []
