@@ -158,7 +158,7 @@ def count_visits(
     view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
     topic = resolve_path_topic(view)
-    mixed_spans = note_robots(view, topic, asked)
+    mixed_spans = note_robots(view, topic, asked, places=True)
     placement = map_placement(view, topic, frame_id if place is None else place.frame_id)
     binned = BinnedWindow(view, asked, by, (topic,), place)
     # `count_since` narrows what is counted. The call remembers the track of this wider window.

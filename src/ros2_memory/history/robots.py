@@ -268,7 +268,7 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
 def note_robots(view: View, topic: str, window: TimeWindow, *, places: bool = False) -> Spans:
     """Notes recordings with different messages on a topic at the same time, and times held twice.
 
-    With `places` the answer has what was seen, which has no place in a time held twice. Returns
+    With `places` the answer says what was where, which is not known in a time held twice. Returns
     these times, without the overlaps of two recordings that a clock explains.
     """
     parallel = parallel_or_twice(view, topic, window)
@@ -281,7 +281,7 @@ def note_robots(view: View, topic: str, window: TimeWindow, *, places: bool = Fa
     for pair in parallel:
         if pair.by_clock:
             is_left_out = places and pair.is_twice
-            what = "what was seen then has no place" if is_left_out else "the two are mixed here"
+            what = "what was where then is not known" if is_left_out else "the two are mixed here"
             view.notes.add(f"{pair.describe_by_clock(topic)}: {what}")
     spans = [pair.span for pair in parallel if pair.is_twice or not pair.by_clock]
     return united((span.start, span.stop) for span in spans)

@@ -98,7 +98,7 @@ def visits(
     view, now, window = open_search(memory, call, span)
     require_recorded(view, window)
     topic = resolve_path_topic(view)
-    mixed = note_robots(view, topic, window)
+    mixed = note_robots(view, topic, window, places=True)
     placement = map_placement(view, topic, frame_id if place is None else place.frame_id)
     scope = Scope(view, clamped(view, window), during=during)
     if place is None:

@@ -336,7 +336,7 @@ class Scope:
         self.since = known_track.since
         inside = known_track.inside(place.region, window)
         self._inside = united((stay.start, stay.stop + 1) for stay in inside)
-        mixed = note_robots(view, resolve_path_topic(view), window)
+        mixed = note_robots(view, resolve_path_topic(view), window, places=True)
         known = placed_times(known_track.track, mixed)
         self.unknown = unknown_times(view, window, known, WHEREABOUTS, mixed=mixed)
 

@@ -357,8 +357,11 @@ def test_visits_are_those_of_the_path_where_the_clock_was_set_back(
         where = {"x": x, "y": 0, "radius_m": 2}
         driven_there = asked(memory, "trajectory_summary", start=T0, end=T0 + 200, where=where)
         assert (driven_there["visits"], driven_there["distance_m"]) == (1, pytest.approx(4))
-        [row] = asked(memory, "visits", **where)["visits"]
+        reply = asked(memory, "visits", **where)
+        [row] = reply["visits"]
         assert [row["arrived"] - T0, row["departed"] - T0] == pytest.approx(seen, abs=0.01)
+        assert reply["unknown_s"] == pytest.approx(100, abs=1)
+        assert "what was where then is not known" in str(reply["notes"])
 
 
 def test_the_first_entry_is_none_that_a_wrong_clock_dated(tmp_path: Path) -> None:
