@@ -100,12 +100,10 @@ def locked(path: Path, flags: int = 0) -> Iterator[int]:
     while True:
         descriptor = os.open(path, _APPEND | flags, 0o666)
         try:
-            with suppress(BlockingIOError):
-                _lock(descriptor)
-                # Another writer may have replaced the file before this one locked it.
-                if is_open_file(path, descriptor):
-                    yield descriptor
-                    return
+            # Another writer may have replaced the file before this one locked it.
+            if _lock(descriptor) and is_open_file(path, descriptor):
+                yield descriptor
+                return
         finally:
             os.close(descriptor)
         if time.monotonic() >= give_up:
@@ -113,12 +111,16 @@ def locked(path: Path, flags: int = 0) -> Iterator[int]:
         time.sleep(_POLL_S)
 
 
-def _lock(descriptor: int) -> None:
+def _lock(descriptor: int) -> bool:
+    """Returns whether a file was locked, or lies on a mount without locks."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise
+    return True
 
 
 def append_lines(descriptor: int, text: str) -> None:

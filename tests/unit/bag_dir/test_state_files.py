@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir import durable_write, state_files
-from ros2_memory.bag_dir.durable_write import flush_bags
+from ros2_memory.bag_dir.durable_write import flush_bags, locked
 from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
 from ros2_memory.bag_dir.own_recordings import LIST
 from ros2_memory.bag_dir.state_files import (
@@ -385,6 +385,12 @@ def test_on_a_mount_without_locks_receipts_are_appended(tmp_path: Path) -> None:
     with broken(fcntl, "flock", errno.EIO), pytest.raises(OSError, match="Input/output"):
         append_receipts(tmp_path, [receipt])
     assert read_receipts(tmp_path) == {receipt.bag: receipt}
+
+
+def test_an_error_of_who_has_locked_a_file_is_passed_on(tmp_path: Path) -> None:
+    """Opening another file may block, as one that a file server has leased."""
+    with pytest.raises(BlockingIOError, match="leased"), locked(tmp_path / "x", os.O_CREAT):
+        raise BlockingIOError("leased")
 
 
 def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(
