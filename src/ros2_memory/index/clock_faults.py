@@ -298,12 +298,18 @@ def _step_faults(
             yield fault
         if fault.before is None or fault.by < FAR_BACK_NS:
             continue
-        sides = [
-            TimeWindow.around(at, FAR_BACK_NS // 2).overlapping(starts, ends)
-            for at in (fault.bag.start, fault.before.end)
-        ]
-        # Of equals the earlier one is wrong: a clock that loses its time falls back.
-        are_strays |= min(sides, key=np.count_nonzero)
+        first, last = fault.bag.start, fault.before.end
+        after, before = (TimeWindow.around(at, FAR_BACK_NS // 2) for at in (first, last))
+        bags_after, bags_before = (
+            np.count_nonzero(side.overlapping(starts, ends)) for side in (after, before)
+        )
+        # Of equals the earlier one is wrong: a clock that loses its time falls back. Its dates
+        # begin, or end, at the step: what lies beyond was recorded at another time.
+        if bags_after <= bags_before:
+            wrong = TimeWindow(first, after.stop)
+        else:
+            wrong = TimeWindow(before.start, min(last + 1, MAX_NS))
+        are_strays |= wrong.overlapping(starts, ends)
     strays = map(timeline.bags.__getitem__, np.flatnonzero(are_strays).tolist())
     yield from (ClockFault(bag, FaultyClock.STRAY) for bag in strays if bag.file not in faulty)
 

@@ -55,6 +55,25 @@ def test_a_clock_that_falls_back_by_years_in_a_recording_leaves_its_last_splits_
     assert found.misdated == {each.file for each in strays}
 
 
+@pytest.mark.parametrize("later", [3, 30])
+def test_what_was_recorded_two_days_later_is_not_dated_by_a_clock_that_was_set_back_by_two(
+    later: int,
+) -> None:
+    wrong = bag("rec_0", NOW - 2 * DAY)
+    others = [bag(f"other{n}", NOW - 2 * DAY + HOUR + n * 10 * S) for n in range(later)]
+    right = [bag(f"rec_{n}", NOW - 4 * DAY + n * 10 * S) for n in range(1, 8)]
+    step = StepBack(wrong, right[0], 2 * DAY)
+    found = check_dates(parted([wrong, *others, *right]), (step,), NOW)
+    assert found.latest == others[-1].end
+    assert found.misdated.isdisjoint(each.file for each in others)
+    before = [bag(f"other{n}", NOW - 4 * DAY - HOUR + n * 10 * S) for n in range(later)]
+    ahead = [bag(f"rec_{n}", NOW - 2 * DAY + n * 10 * S) for n in range(50)]
+    found = check_dates(
+        parted([*before, *ahead, right[0]]), (step._replace(before=ahead[-1]),), NOW
+    )
+    assert (found.earliest, found.misdated) == (before[0].start, {right[0].file})
+
+
 def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> None:
     odd = [bag("sim", 5 * S), bag("boot", 6 * S, written=20 * S)]
     found = check_dates(parted([*GOOD, *odd]), (), NOW)
