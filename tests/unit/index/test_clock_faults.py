@@ -71,7 +71,7 @@ def test_what_was_recorded_two_days_later_is_not_dated_by_a_clock_that_was_set_b
     found = check_dates(
         parted([*before, *ahead, right[0]]), (step._replace(before=ahead[-1]),), NOW
     )
-    assert (found.earliest, found.misdated) == (before[0].start, {right[0].file})
+    assert (found.earliest, found.misdated) == (before[0].start, frozenset({right[0].file}))
 
 
 def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> None:

@@ -31,7 +31,16 @@ S = 10**9
 NOW = 1_800_000_000 * S
 FOLDERS = (".", "rec_1", "rec_2", "day/rec_3", ".trash")
 
-NAMES = ("a.mcap", "b.mcap", "a.mcap.zstd", "c.db3", "d.db3.zstd", "notes.txt")
+NAMES = (
+    "a.mcap",
+    "b.mcap",
+    "a.mcap.zstd",
+    "rec_1_0.mcap",
+    "rec_1_0.mcap.zstd",
+    "c.db3",
+    "d.db3.zstd",
+    "notes.txt",
+)
 
 WAITS_S = (0.0, 0.0, 0.001, 1.0, 2.0, 5.0, 14.0, 31.0, 700.0)
 
