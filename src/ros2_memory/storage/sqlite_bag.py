@@ -24,7 +24,7 @@ from typing import IO, TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
-from ros2_memory.core.errors import BagContradictionError
+from ros2_memory.core.errors import BagContradictionError, sqlite_code
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
@@ -65,7 +65,7 @@ _CACHE_BYTES: Final = 16 << 20
 _ROWS: Final = """
     SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END, timestamp,
         typeof(timestamp) = 'integer' AND typeof(data) = 'blob'
-    FROM messages NOT INDEXED ORDER BY rowid
+    FROM messages NOT INDEXED ORDER BY rowid LIMIT ?
 """
 """Topic id, log time, and whether the types of a row are those of a message."""
 _ROWS_AT_ONCE: Final = 1 << 16
@@ -76,6 +76,11 @@ _ASCENDING: Final = """
     ORDER BY timestamp, rowid
 """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
+_FIRST_ROWS: Final = (
+    "FROM (SELECT timestamp, rowid, topic_id FROM messages NOT INDEXED ORDER BY rowid LIMIT {})"
+)
+_ALL_ROWS: Final = -1
+"""As a limit of a query."""
 _WRONG_INDEX: Final = f"its index by time is damaged; {READ_WITHOUT_INDEXES}"
 _METADATA: Final = (
     ("offered_qos_profiles", "offered_qos_profiles"),
@@ -118,10 +123,17 @@ class _Topics:
         channels: the channels by topic id.
         is_indexed_right: whether the indexes agree with the table of messages; None if they were
             not compared yet.
+        readable: how many rows of the table can be read, if it ends early.
     """
 
     channels: Mapping[int, Channel]
     is_indexed_right: bool | None = None
+    readable: int = _ALL_ROWS
+
+    @property
+    def ends_early(self) -> bool:
+        """Whether messages are lost; known once the indexes were compared."""
+        return self.readable != _ALL_ROWS
 
 
 class SqliteBags:
@@ -150,7 +162,7 @@ class SqliteBags:
             is_right = self._is_indexed_right(base, topics)
             tally = Tally()
             without_time = without_topic = 0
-            cursor = base.execute(_ROWS)
+            cursor = base.execute(_ROWS, (topics.readable,))
             while rows := cursor.fetchmany(_ROWS_AT_ONCE):
                 numbers: list[int] = []
                 times: list[Ns] = []
@@ -170,12 +182,15 @@ class SqliteBags:
                     zeros = np.zeros(len(times), np.int64)
                     tally.add(np.array(numbers, np.int64), np.array(times, np.int64), zeros)
         notes = [] if is_right else [_WRONG_INDEX]
+        if topics.ends_early:
+            notes = [f"damaged: only its first {counted(topics.readable, 'message')} can be read"]
         if without_topic:
             notes.append(f"left out: {counted(without_topic, 'message')} of no topic")
         if without_time:
             reason = "without a possible log time"
             notes.append(f"left out: {counted(without_time, 'message')} {reason}")
-        return tally.contents().summary(topics.channels, tuple(notes))
+        is_complete = not topics.ends_early
+        return tally.contents().summary(topics.channels, tuple(notes), complete=is_complete)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""
@@ -198,10 +213,10 @@ class SqliteBags:
                 if channel.topic in topics
             }
             is_right = self._is_indexed_right(base, declared)
-            if not is_right:
+            if not is_right and not declared.ends_early:
                 yield Lost(_WRONG_INDEX, window.start, window.stop - 1, BagContradictionError)
             for time, row, number in _ordered_rows(
-                base, wanted, window, newest_first=newest_first, indexed=is_right
+                base, wanted, window, declared.readable, newest_first=newest_first, indexed=is_right
             ):
                 stored, *stored_key = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
                 if not isinstance(stored, bytes):
@@ -234,6 +249,8 @@ class SqliteBags:
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
                 topics.is_indexed_right = False
+            if not topics.is_indexed_right:
+                topics.readable = _readable_rows(base)
         return topics.is_indexed_right
 
     @contextmanager
@@ -251,6 +268,8 @@ class SqliteBags:
             if path.lstat().st_ino != key.inode:
                 raise UnreadableError("it was replaced while it was being opened")
             base.text_factory = _TEXT
+            # Else sqlite reads nothing of a file that was cut short.
+            base.execute("PRAGMA writable_schema = ON")
             guard(base, self._limit.max_bytes, file_bytes)
             topics = self._known.get(key)
             if topics is None:
@@ -298,6 +317,7 @@ def _ordered_rows(
     base: sqlite3.Connection,
     wanted: Collection[int],
     window: TimeWindow,
+    readable: int = _ALL_ROWS,
     *,
     newest_first: bool = False,
     indexed: bool,
@@ -306,8 +326,27 @@ def _ordered_rows(
     query = _DESCENDING if newest_first else _ASCENDING
     arguments = (max(window.start, 0), window.stop, json.dumps(list(wanted)))
     if not indexed:
-        query = query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
+        query = query.replace("FROM messages", _FIRST_ROWS.format(readable), 1)
     return base.execute(query, arguments)
+
+
+def _readable_rows(base: sqlite3.Connection) -> int:
+    """Returns how many rows of the table of messages can be read; `_ALL_ROWS` if it is whole.
+
+    Raises:
+        sqlite3.DatabaseError: none can be read, or the file is not at fault.
+    """
+    count = 0
+    try:
+        for (payload,) in base.execute("SELECT data FROM messages NOT INDEXED ORDER BY rowid"):
+            if payload is None:  # the rest of a page that was cut reads as zeros
+                return count
+            count += 1
+    except sqlite3.DatabaseError as error:
+        if not count or sqlite_code(error) != sqlite3.SQLITE_CORRUPT:
+            raise
+        return count
+    return _ALL_ROWS
 
 
 def _columns(base: sqlite3.Connection, table: str) -> set[str]:

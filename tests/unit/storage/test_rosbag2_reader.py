@@ -255,3 +255,24 @@ def test_the_bag_of_2018_has_no_format_column_short_type_names_and_no_index(tmp_
     records = read(reader, path)
     assert times(records) == [1, 1, 2, 3]
     assert getattr(reader.decode(records[0]), "data", "") == "hello"
+
+
+@pytest.mark.parametrize("zeros", [0, 500, 20_000])
+def test_of_a_file_that_is_damaged_further_on_the_first_messages_are_read(
+    tmp_path: Path, zeros: int
+) -> None:
+    path = write_db3(tmp_path / "run_0.db3", [text(time, "x" * 200) for time in range(2000)])
+    data = bytearray(path.read_bytes())
+    at = len(data) * 4 // 5 // 4096 * 4096  # where a page ends
+    data[at - zeros :] = bytes(zeros) + data[at:] if zeros else b""
+    path.write_bytes(data)
+    reader = Rosbag2Reader()
+    summary = reader.summarize(path)
+    assert 1000 < summary.count < 2000
+    assert not summary.complete
+    [note] = summary.schema.notes
+    assert note == f"damaged: only its first {summary.count} messages can be read"
+    for newest_first in (False, True):
+        records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+        found = [record.log_time for record in records]
+        assert found == sorted(range(summary.count), reverse=newest_first)
