@@ -55,7 +55,7 @@ MOST_BAGS: Final = 2_000
 MOST_BYTES: Final = 64 << 20
 """Bytes of one batch, whose rows are in memory until it is committed."""
 _GROUP: Final = 64
-"""Bags whose rows are made at once: messages read around one bag are needed for the next."""
+"""Bags that are looked at together: messages read around one bag are needed for the next."""
 PATIENCE_S: Final = 30.0
 """How long a bag directory may take to answer."""
 _BESIDE_NS: Final[Ns] = NS_PER_DAY
@@ -573,15 +573,14 @@ def _is_cut(
 
 
 def _fit_in_group(bags: Sequence[_BagToShip], most: int) -> bool:
-    """Returns whether the rows of bags may be made at once: few, small, and close in time.
+    """Returns whether the rows of bags may be made at once: of one hour, few and small.
 
-    All but the last bag are known to fit.
+    The track of a bag is cut out of that of its hour.
     """
-    before, last = bags[-2].file, bags[-1].file
     return (
-        len(bags) <= min(most, _GROUP)
+        len(bags) <= most
         and sum(to_ship.file.size for to_ship in bags) <= MOST_BYTES
-        and before.start <= last.start <= before.end + PART_NS
+        and len({to_ship.file.start // PART_NS for to_ship in bags}) == 1
     )
 
 

@@ -143,6 +143,25 @@ def test_columns_that_another_program_deletes_or_damages_keep_no_bag_from_being_
     assert (done.bags, len(done.problems)) == (BAGS - 1, 1)
 
 
+def test_rows_of_the_bags_of_an_hour_are_made_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is cut out of the track of its hour, which a group of other bags would make again."""
+    made, groups = RowMaker.rows, list[list[str]]()
+
+    def noted(maker: RowMaker, bags: Any) -> Any:
+        groups.append([shipped.file for shipped in bags.values()])
+        return made(maker, bags)
+
+    monkeypatch.setattr(RowMaker, "rows", noted)
+    begin = START_S // 3600 * 3600
+    for number, at_s in enumerate((begin - 20, begin - 10, begin, begin + 10, begin + 3590)):
+        write_bag(tmp_path / "hall", number, at_s=at_s)
+    assert ship_from(tmp_path, most_bags=100).bags == 5
+    named = [[f"rec/rec_{number}.mcap" for number in hour] for hour in ((0, 1), (2, 3, 4))]
+    assert groups == named
+
+
 def test_a_thing_has_the_name_by_which_people_ask_for_it(tmp_path: Path) -> None:
     seen = detections(START_S * 10**9, ["Scissors", "safety_goggles", "cups"])
     write_mcap(tmp_path / "hall" / "rec" / "rec_0.mcap", [seen])
