@@ -36,7 +36,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_DAY, Clock, Ns, utc_day
 from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
 from ros2_memory.lake.tables import TABLES, ShippedBag, bags_condition, window_condition
-from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
+from ros2_memory.lake.upkeep import Tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -203,10 +203,8 @@ class Shipper:
             robot.report(f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
-        # Before the tombstone: after a kill it repeats the deletion in the lake, not this one.
+        # Before the tombstones: after a kill these repeat the deletion in the lake, not this one.
         self.done.problems += robot.forget([tombstone.window for tombstone in new])
-        for tombstone in new:
-            append_tombstone(self.lake.location.state_dir, tombstone, done=False)
         for tombstone in new:
             self.alive()
             gone = forget_in_lake(self.lake, tombstone)

@@ -134,16 +134,15 @@ class LakeTable:
 
     def to_arrow(self, rows: Iterable[Row]) -> pa.Table:
         """Returns rows for Arrow, with `time` and `topic_key`. NaN becomes null, except in maps."""
-        first = next((name for name in _FIRST_TIMES if name in self.columns), None)
-        whole: list[Row] = []
-        for row in rows:
-            # `time` repeats the first time, in microseconds.
-            time = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
-            key = str(row.get("topic", "")).strip("/").replace("/", ".")
-            whole.append({"topic_key": key, **time, **row})
-        columns = [
-            _column(field, [row.get(field.name) for row in whole]) for field in self.arrow_schema
-        ]
+        whole = [*rows]
+        values = {name: [row.get(name) for row in whole] for name in self.columns}
+        if "time" in values:  # repeats the first time, in microseconds
+            first = next(name for name in _FIRST_TIMES if name in values)
+            values["time"] = [cast("int", time) // NS_PER_US for time in values[first]]
+        if "topic_key" in values:
+            topics = map(str, values["topic"])
+            values["topic_key"] = [topic.strip("/").replace("/", ".") for topic in topics]
+        columns = [_column(field, values[field.name]) for field in self.arrow_schema]
         return pa.Table.from_arrays(columns, schema=self.arrow_schema)
 
 

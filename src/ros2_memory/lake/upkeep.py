@@ -250,13 +250,14 @@ class Forgotten(NamedTuple):
 
 
 def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
-    """Deletes the rows that a tombstone names, in all versions; the tombstone must be written.
+    """Writes a tombstone, and deletes the rows that it names, in all versions.
 
     After a kill it is called again.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
+    append_tombstone(lake.location.state_dir, tombstone, done=False)
     bags = _bags_to_forget(lake, tombstone)
     # `channels` comes last: while it has a row of a bag, other tables may have some.
     for name in reversed([*TABLES]):

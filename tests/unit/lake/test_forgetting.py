@@ -68,7 +68,6 @@ TOMBSTONE = Tombstone("hall", (START_S + 70) * NS_PER_S, (START_S + 75) * NS_PER
 
 def forget(lake: Path, what: Tombstone) -> Forgotten:
     where = location(lake)
-    append_tombstone(where.state_dir, what, done=False)
     with where.writable() as tables:
         return forget_in_lake(tables, what)
 

@@ -176,11 +176,7 @@ class _ShippingService:
                 done.
             LakeError: the lake cannot be read or written; the next start finishes it.
         """
-        from ros2_memory.lake.upkeep import (  # noqa: PLC0415
-            Tombstone,
-            append_tombstone,
-            forget_in_lake,
-        )
+        from ros2_memory.lake.upkeep import Tombstone, forget_in_lake  # noqa: PLC0415
 
         tombstone = Tombstone(robot, window.start, window.stop)
         with self.location.writable() as lake:
@@ -194,7 +190,6 @@ class _ShippingService:
             for configured in self.robots:
                 if configured.name == robot:
                     failures += configured.forget([window])
-            append_tombstone(self.location.state_dir, tombstone, done=False)
             gone = forget_in_lake(lake, tombstone)
         kept_by = [*gone.kept_by]
         if as_json:
