@@ -151,9 +151,13 @@ class HandoverTransfer:
 
     @property
     def missing(self) -> frozenset[str]:
-        """The listed topics that only the old recorder has subscribed to so far."""
-        is_listed = self.orders.topics.selection.matches
-        return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
+        """The listed topics that only the old recorder has subscribed to so far.
+
+        The new one subscribes to none of several types, one of which may be the old one's alone.
+        """
+        is_listed, new = self.orders.topics.selection.matches, self.new
+        others = self.old.subscribed - new.subscribed - new.of_several_types.keys()
+        return frozenset(filter(is_listed, others))
 
     def advance(self, now: ClockReading) -> Step:
         """Returns the step that is due. Call it several times a second.

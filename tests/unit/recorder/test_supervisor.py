@@ -374,19 +374,26 @@ def test_while_publishers_disagree_on_a_type_messages_are_missing_and_not_later(
 def test_a_topic_whose_publishers_have_another_type_now_is_subscribed_to_again(
     tmp_path: Path,
 ) -> None:
-    """A new recording does so: only the old one's subscription has the type of before."""
+    """A new recording does so once the old one, whose subscription has the other type, has ended.
+
+    It does not wait for that subscription.
+    """
     world = World(tmp_path)
     world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
     world.started(60)
     [old] = world.running
-    old.heard = ("/bumper",)
+    old.heard = world.defaults["topics"] = world.defaults["heard"] = ("/bumper",)
     with capture_logs() as logs:
-        for _ in range(80):
-            if old.status is None:
-                old.lines.append(SEVERAL_TYPES.format("/door"))
+        while old.status is None and world.mono < 1_100:
+            for recorder in world.running:
+                recorder.lines.append(SEVERAL_TYPES.format("/door"))
             world.run(0.5)
-        world.run(300)
+        [new] = world.running
+        new.heard = TOPICS
+        new.lines.append("[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '/door'")
+        world.run(400)
     assert [len(events(logs, name)) for name in ("asking_again", "rotated")] == [1, 1]
+    assert not events(logs, "rotated_without")
     assert world.heartbeat()["fell_silent"] == []
 
 
