@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 MAX_DISTINCT: Final = 200
 """So many different warnings of a kind are reported of one recording."""
+REPEATED_S: Final = 5.0
+"""What the child reports again and again is over if it has not reported it for so long."""
 EMPTY_GRACE_S: Final = 5.0
 """A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 _LAST_LINES: Final = 6
@@ -307,7 +309,7 @@ class RecordingSession:
         several = {
             topic
             for topic, reported_s in self.of_several_types.items()
-            if now.monotonic_s - reported_s < SETTLE_S
+            if now.monotonic_s - reported_s < REPEATED_S
         }
         return self.of_unknown_type | several - self.subscribed
 
@@ -494,7 +496,7 @@ class RecordingSessions:
         said = current.last_output or "it prints no reason"
         sentence = f"ros2 bag record does not begin to record: {said}"
         self.events.fail("recorder_not_ready", sentence, recording=current.name)
-        self.restarts += 1
+        self._note_interruption(current, "hung")
         current.end()
         self.current = None
         return True
@@ -648,7 +650,7 @@ class RecordingSessions:
             self.events.remark(
                 "rotated_without",
                 f"the new recording does not subscribe to {missing} yet: their publishers have "
-                "gone, disagree on the type, or were not discovered in time",
+                "gone, or were not discovered in time",
                 recording=handover.new.name,
             )
         handover.complete(now)

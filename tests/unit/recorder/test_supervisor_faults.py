@@ -96,6 +96,9 @@ def test_a_recorder_that_does_not_begin_is_given_up_and_another_is_started(tmp_p
     assert len(world.logged(4, "recorder_not_ready")) == 1
     assert [recorder.status for recorder in world.recorders] == [0, None]
     assert world.heartbeat()["restarts"] == 1
+    world.running[0].ready_s = 20
+    world.run(20)
+    assert world.house.restarts == [(T0, "hung")]
 
 
 def test_a_recorder_that_dies_before_its_first_byte_leaves_no_directory(tmp_path: Path) -> None:
