@@ -170,7 +170,7 @@ class TopicWatch:
         if len(sessions.running) > 1 or current.age_s(now) < TYPES_S:
             # A new recording has not discovered all topics yet.
             offered.update(self._offered_since_s)
-            unknown.update(self.shortfall.unknown_types)
+            unknown.update({*self.shortfall.unknown_types} - current.subscribed)
         self._offered_since_s = {
             topic: self._offered_since_s.get(topic, now_s) for topic in offered
         }

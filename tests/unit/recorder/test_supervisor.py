@@ -390,7 +390,11 @@ def test_a_topic_whose_publishers_have_another_type_now_is_subscribed_to_again(
             world.run(0.5)
         [new] = world.running
         new.heard = TOPICS
+        world.run(2)
+        assert world.heartbeat()["unknown_types"] == ["/door"]
         new.lines.append("[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '/door'")
+        world.run(2)
+        assert world.heartbeat()["unknown_types"] == []
         world.run(400)
     assert [len(events(logs, name)) for name in ("asking_again", "rotated")] == [1, 1]
     assert not events(logs, "rotated_without")
