@@ -304,13 +304,13 @@ class RecordingSession:
         more, self._lost_before = self._lost - self._lost_before, self._lost.copy()
         return more
 
+    def several_types_since(self, monotonic_s: float) -> set[str]:
+        """Returns the topics that the child has reported since then to have several types."""
+        return {topic for topic, at_s in self.of_several_types.items() if at_s > monotonic_s}
+
     def refused_types(self, now: ClockReading) -> set[str]:
         """Returns the topics that the child does not subscribe to because of their types."""
-        several = {
-            topic
-            for topic, reported_s in self.of_several_types.items()
-            if now.monotonic_s - reported_s < REPEATED_S
-        }
+        several = self.several_types_since(now.monotonic_s - REPEATED_S)
         return self.of_unknown_type | several - self.subscribed
 
     def silent_topics(self) -> frozenset[str]:
@@ -611,8 +611,7 @@ class RecordingSessions:
         self, session: RecordingSession, closed: Sequence[str], now: ClockReading
     ) -> None:
         """Counts what newly closed splits have received and lost, and flushes them."""
-        since_s = self.closed_s
-        of_types = {topic for topic, at_s in session.of_several_types.items() if at_s > since_s}
+        of_types = session.several_types_since(self.closed_s)
         for name in closed:
             self.events.info("split_closed", recording=session.name, file=name)
             self.orders.reception.learn(session.name, session.splits.directory / name, of_types)
