@@ -868,7 +868,8 @@ def trajectory_summary(
     one for 1. `farthest` is the point from which the farthest pose is wanted.
     """
     view, window = open_span(memory, call, span)
-    name = resolve_path_topic(view, topic)
+    view.followed = topic
+    name = resolve_path_topic(view)
     path, _ = driven_path(view, name, window)
     if path is None:
         raise no_path(view, name, window)

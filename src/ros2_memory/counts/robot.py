@@ -79,7 +79,8 @@ def count_path(
     """
     place_asked = None if where is None else parse_where(memory.limits, where)
     view, asked = open_span(memory, call, span)
-    name = resolve_path_topic(view, topic)
+    view.followed = topic
+    name = resolve_path_topic(view)
     binned = BinnedWindow(view, asked, by, (name,), place_asked)
     path, since = path_by_poses(view, name, binned.counted)
     if path is None or not path.poses:

@@ -465,9 +465,9 @@ def body_of(view: View, topic: str) -> Body | None:
 def body_by_transforms(view: View) -> Body | None:
     """Returns the robot's body if transforms place it; None if a topic of poses does.
 
-    Transforms place it if no topic has its poses, or if `data.pose_topic` is one of transforms.
+    Transforms place it if no topic has its poses, or if the topic that places it is one of theirs.
     """
-    body = body_of(view, view.pose_topic)
+    body = body_of(view, view.followed or view.pose_topic)
     if body is None and not view.has_poses:
         return robot_body(view)
     return body
@@ -482,6 +482,7 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
         NoDataError: as for `resolve_pose_topic`.
     """
     topics = view.moving_topics
+    name = name or view.followed
     if name is None and view.pose_topic in topics:
         name = view.pose_topic
     body, why = None, ""

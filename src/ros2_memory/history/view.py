@@ -77,6 +77,7 @@ class View:
         stream: all bags as one stream.
         snapshot: the index.
         timeline: the bags in the order of time.
+        followed: the topic of poses that the question names; places are of these then.
         notes: what the reply reports besides its answer.
         memo: what was found out by this view.
     """
@@ -91,6 +92,7 @@ class View:
         self.timeline = self.snapshot.timeline
         self.limits, self.extractor = memory.limits, memory.extractor
         self.bag_dir = memory.bag_dir
+        self.followed: str | None = None
         self.notes = self.bags.notes
         self.memo = Memo()
 

@@ -100,7 +100,8 @@ def driven_inside(
     """
     place = None if where is None else parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
-    name = resolve_path_topic(view, topic)
+    view.followed = topic
+    name = resolve_path_topic(view)
     path, _ = driven_path(view, name, window)
     if path is None or not path.poses:
         raise no_path(view, name, window)
@@ -234,7 +235,7 @@ def farthest_from(
     Args:
         view: the view of this call.
         value: the point, as `parse_where` takes a place.
-        topic: the topic of the poses, which must be the robot's.
+        topic: the topic of the poses.
         spans: the times of the poses, in order; both ends are inclusive.
         frame_id: the frame of the point; None for the frame of places.
 
@@ -245,10 +246,6 @@ def farthest_from(
     place = parse_where(view.limits, value, 1.0, _FARTHEST_FROM)
     if place.several:
         raise InvalidArgumentsError(f"{_FARTHEST_FROM} has several places; give one, or x and y")
-    if topic != (robot_topic := resolve_path_topic(view)):
-        raise InvalidArgumentsError(
-            f"{_FARTHEST_FROM} is measured along {robot_topic}: leave out topic"
-        )
     frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
     min_x, max_x, min_y, max_y = place.region.bounds
     x, y = (min_x + max_x) / 2, (min_y + max_y) / 2

@@ -97,16 +97,15 @@ class TrackReader:
         self._view = view
         self._frame_id = frame_id
         body = body_by_transforms(view)
+        topic = view.followed or view.pose_topic
         self._body = None if body is None else body.child
-        self._topics = (view.pose_topic,) if body is None else view.limits.tf_topics
-        self._own_frame = (
-            frame_of_newest_pose(view, view.pose_topic) if body is None else body.child
-        )
+        self._topics = (topic,) if body is None else view.limits.tf_topics
+        self._own_frame = frame_of_newest_pose(view, topic) if body is None else body.child
         # Before an update the robot may have published its poses in another frame.
         self._is_own = (
             body is None
             and self._own_frame == frame_id
-            and frame_of_oldest_pose(view, view.pose_topic) == frame_id
+            and frame_of_oldest_pose(view, topic) == frame_id
         )
         # Of a time that files have twice, those from before count, as for the path.
         everything = TimeWindow.everything()
