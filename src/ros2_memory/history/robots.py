@@ -21,7 +21,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, Span, iso_local
+from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns, Span, iso_local, unix_from_ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import copies_in
 from ros2_memory.history.view import View
@@ -43,6 +43,10 @@ _SLOW_NS: Final = 600 * NS_PER_S
 minutes, and in a few seconds each recorder may lose what the other one receives."""
 _TRIED: Final = 7
 """So many messages are looked for in the other recording: a subscriber may miss some."""
+_FEWEST_SHIFTED: Final = 2
+"""So many different messages show that two clocks differ: two robots, too, say one alike."""
+_CLOCK_DRIFT_NS: Final = 200 * NS_PER_MS
+"""The difference of two clocks changes by less than this while both record."""
 _MAX_PAIRS: Final = 20
 """At most so many pairs of recordings are compared for the whole memory."""
 _MAX_TOPICS: Final = 3
@@ -57,6 +61,8 @@ MOST_REMEMBERED: Final = 1_000
 """So many comparisons of two recordings are remembered: each window of a question is one."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: by topic, pair and window, whether the recordings hold different messages."""
+_SHIFTS: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], Ns | None]]] = Key()
+"""Of a timeline: by topic, pair and window, how far apart the recordings hold the same messages."""
 
 
 _TREES: Final[Key[dict[tuple[str, int], Mapping[str, str]]]] = Key()
@@ -212,8 +218,9 @@ class ParallelRecordings(NamedTuple):
         span: when both hold the topic.
         by_clock: whether a wrong clock explains it: the span is the end of the first and the begin
             of the other, and less than half of each; or one of them has a wrong date; or one
-            recorder made both, one after the other.
+            recorder made both, one after the other; or `shift` is known.
         bags: the files of the other recording that overlap the first; empty for all in its folder.
+        shift: how much later (ns) the other one has the same messages; None if it has others.
     """
 
     first: Path
@@ -221,6 +228,7 @@ class ParallelRecordings(NamedTuple):
     span: TimeWindow
     by_clock: bool
     bags: frozenset[str] = frozenset()
+    shift: Ns | None = None
 
     @property
     def is_twice(self) -> bool:
@@ -234,10 +242,11 @@ class ParallelRecordings(NamedTuple):
             return (
                 f"{self.first.name} has the time {span} twice, as the clock was set back meanwhile"
             )
-        return (
-            f"{self.first.name} and {self.other.name} differ on {topic} {span}, as after a clock "
-            "was set back, or of two robots"
-        )
+        both = f"{self.first.name} and {self.other.name}"
+        if self.shift is not None:
+            apart_s = unix_from_ns(abs(self.shift))
+            return f"{both} have the same messages of {topic} {apart_s:.2f} s apart {span}"
+        return f"{both} differ on {topic} {span}, as after a clock was set back, or of two robots"
 
 
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
@@ -317,14 +326,16 @@ def recordings_apart(
 ) -> frozenset[Path] | None:
     """Returns the recordings that differ from a parallel one on some topics, latched ones too.
 
-    None if unknown; see `_parallel_recordings`.
+    Not those that have its messages by another clock. None if unknown; see `_parallel_recordings`.
     """
     apart: set[Path] = set()
     for topic in topics:
         pairs = _parallel_recordings(view, topic, window)
         if pairs is None:
             return None
-        apart.update(path for pair in pairs for path in (pair.first, pair.other))
+        apart.update(
+            path for pair in pairs if pair.shift is None for path in (pair.first, pair.other)
+        )
     return frozenset(apart)
 
 
@@ -347,8 +358,10 @@ def _parallel_recordings(
                 is_known = not parallel.by_clock and apart.issuperset(pair)
                 both = parallel.span.intersect(window.widened(_SLOW_NS))
                 if not is_known and _differ(view, topic, pair, both):
-                    differing.append(parallel)
-                    apart.update(() if parallel.by_clock else pair)
+                    shift = _shift_of_clock(view, topic, pair, parallel.span)
+                    by_clock = parallel.by_clock or shift is not None
+                    differing.append(parallel._replace(by_clock=by_clock, shift=shift))
+                    apart.update(() if by_clock else pair)
             return differing
     except QueryTimeoutError:
         view.notes.add(
@@ -508,11 +521,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     known = remembered.get(key)
     if known is not None:
         return known
-    near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
-    loose = loose_bags_beside_others(view.snapshot)
-    first, other = (
-        [extent for extent in near if _recording_of(extent.bag, loose) == path] for path in pair
-    )
+    first, other = _extents_of(view, topic, pair, both.widened(COPY_HORIZON_NS))
     with view.bags.watched() as reading:
         # Most, not all: two runs of a simulation share some, while the robot has not moved yet.
         differ = bool(first and other) and all(
@@ -531,6 +540,57 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     return differ
 
 
+def _extents_of(
+    view: View, topic: str, pair: tuple[Path, Path], window: TimeWindow
+) -> Iterator[list[TopicExtent]]:
+    """Yields for each of two recordings where it has a topic in a window."""
+    near = view.stream.overlapping_bags([topic], window)
+    loose = loose_bags_beside_others(view.snapshot)
+    for path in pair:
+        yield [extent for extent in near if _recording_of(extent.bag, loose) == path]
+
+
+def _shift_of_clock(view: View, topic: str, pair: tuple[Path, Path], span: TimeWindow) -> Ns | None:
+    """Returns how much later (ns) the second of two recordings has the messages of the first.
+
+    None if it has others, by a sample of poses, or else of the topic: most of what the first has
+    once around the other has once, too, and as much later.
+    """
+    if _recordings_with(view, view.pose_topic).keys() >= {*pair}:
+        topic = view.pose_topic
+    remembered, key = view.timeline.memo.of(_SHIFTS, dict), (topic, pair, span)
+    if key in remembered:
+        return remembered[key]
+    around = span.widened(_NEAR_NS)
+    first, other = _extents_of(view, topic, pair, around)
+    payloads, shifts = set[int](), list[Ns]()
+    with view.bags.watched() as reading:
+        sample = [*_sampled(view, topic, first, around)]
+        for stored in sample:
+            payload = stored.identity[1]
+            near = view.stream.merged(other, [topic], TimeWindow.around(stored.time, _NEAR_NS))
+            equal = [each.time - stored.time for each in near if each.identity[1] == payload]
+            if len(equal) == 1:
+                payloads.add(payload)
+                shifts += equal
+    are_enough = len(payloads) >= _FEWEST_SHIFTED and 2 * len(shifts) > len(sample)
+    is_alike = are_enough and max(shifts) - min(shifts) <= _CLOCK_DRIFT_NS
+    shift = sorted(shifts)[len(shifts) // 2] if is_alike else None
+    if reading.is_final and len(remembered) < MOST_REMEMBERED:
+        remembered[key] = shift
+    return shift
+
+
+def _sampled(
+    view: View, topic: str, extents: Sequence[TopicExtent], window: TimeWindow
+) -> Iterator[StoredMessage]:
+    """Yields some messages from all over a window."""
+    length = window.stop - window.start
+    edges = [window.start + length * nth // _TRIED for nth in range(_TRIED + 1)]
+    for start, stop in pairwise(edges):
+        yield from islice(view.stream.merged(extents, [topic], TimeWindow(start, stop)), 1)
+
+
 def _lacks_most(
     view: View,
     topic: str,
@@ -539,13 +599,8 @@ def _lacks_most(
     both: TimeWindow,
 ) -> bool:
     """Whether `other` lacks most messages of `first`, by a sample from all over a window."""
-    length = both.stop - both.start
-    edges = [both.start + length * nth // _TRIED for nth in range(_TRIED + 1)]
     tried, lacking = 0, 0
-    for start, stop in pairwise(edges):
-        stored = next(view.stream.merged(first, [topic], TimeWindow(start, stop)), None)
-        if stored is None:
-            continue
+    for stored in _sampled(view, topic, first, both):
         tried += 1
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
         others = ((1, message) for message in view.stream.merged(other, [topic], near))

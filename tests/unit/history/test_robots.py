@@ -398,6 +398,30 @@ def test_a_recorder_that_knows_publish_times_beside_one_that_does_not_makes_no_s
         assert figures(memory) == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_recorder_whose_clock_is_ahead_makes_no_second_robot(tmp_path: Path) -> None:
+    """A base station receives the robot's poses and tasks, and dates them by its own clock."""
+    tasks = ["dock", "drive", "drill", "scan", "drive", "drill", "dock"]
+    said = [text(T0 + (5 + 8 * n) * S, task, "/task") for n, task in enumerate(tasks)]
+    record(tmp_path, "rover", in_order([*drive(0.0), *said]))
+    expected = asked(memory_of(tmp_path), "trajectory_summary", **WINDOW)["distance_m"]
+    late = [
+        replace(each, log_time=at, publish_time=at)
+        for each in [*drive(0.0), *said]
+        for at in [each.log_time + 1_200_000_000]
+    ]
+    record(tmp_path, "station", in_order(late))
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        (note,) = asked(memory, "memory_status")["notes"]
+        assert "rover and station have the same messages of /odom 1.20 s apart" in note
+        path = asked(memory, "trajectory_summary", **WINDOW)
+        assert path["distance_m"] == pytest.approx(expected, abs=0.1)
+        drilled = {"topic": "/task", "condition_type": "equals", "value": "drill"}
+        visited = asked(memory, "visits", x=0, y=3, radius_m=9, **{"while": drilled})
+        assert visited["minutes"] == pytest.approx(16 / 60, abs=0.05)
+        assert visited.get("unknown_s", 0) < 8
+        assert "several robots" not in str([path, visited])
+
+
 def test_equal_messages_of_a_recorder_count_though_one_was_received_as_it_was_published(
     tmp_path: Path,
 ) -> None:
