@@ -236,17 +236,25 @@ class ParallelRecordings(NamedTuple):
         return self.first == self.other
 
     def describe_by_clock(self, topic: str) -> str:
-        """Returns a sentence, without a full stop, on a pair that a clock explains."""
+        """Returns a sentence, without a full stop, on a pair that a clock explains.
+
+        Pairs of the same two recorders have the same one: there may be hundreds.
+        """
+        if self.shift is not None:
+            apart_s = unix_from_ns(abs(self.shift))
+            return (
+                f"two recorders have the same messages of {topic} {apart_s:.1f} s apart, as their "
+                "clocks differ"
+            )
         span = f"from {unix_text(self.span.start)} to {unix_text(self.span.stop - 1)}"
         if self.is_twice:
             return (
                 f"{self.first.name} has the time {span} twice, as the clock was set back meanwhile"
             )
-        both = f"{self.first.name} and {self.other.name}"
-        if self.shift is not None:
-            apart_s = unix_from_ns(abs(self.shift))
-            return f"{both} have the same messages of {topic} {apart_s:.2f} s apart {span}"
-        return f"{both} differ on {topic} {span}, as after a clock was set back, or of two robots"
+        return (
+            f"{self.first.name} and {self.other.name} differ on {topic} {span}, as after a clock "
+            "was set back, or of two robots"
+        )
 
 
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
@@ -270,7 +278,8 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"{listed(names)}; ask about a time with one of them, or set data.recording to one",
         )
     for pair in parallel:
-        before = "files from before" if pair.is_twice else pair.first.name
+        named = pair.first.name if pair.shift is None else "the first"
+        before = "files from before" if pair.is_twice else named
         view.notes.add(f"{pair.describe_by_clock(topic)}: the path there is that of {before}")
 
 

@@ -402,19 +402,22 @@ def test_a_recorder_whose_clock_is_ahead_makes_no_second_robot(tmp_path: Path) -
     """A base station receives the robot's poses and tasks, and dates them by its own clock."""
     tasks = ["dock", "drive", "drill", "scan", "drive", "drill", "dock"]
     said = [text(T0 + (5 + 8 * n) * S, task, "/task") for n, task in enumerate(tasks)]
-    record(tmp_path, "rover", in_order([*drive(0.0), *said]))
+    sent = in_order([*drive(0.0), *said])
+    record(tmp_path, "rover_1", sent[:40])
+    record(tmp_path, "rover_2", sent[40:])
     expected = asked(memory_of(tmp_path), "trajectory_summary", **WINDOW)["distance_m"]
     late = [
         replace(each, log_time=at, publish_time=at)
-        for each in [*drive(0.0), *said]
+        for each in sent
         for at in [each.log_time + 1_200_000_000]
     ]
-    record(tmp_path, "station", in_order(late))
+    record(tmp_path, "station", late)
     for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
         (note,) = asked(memory, "memory_status")["notes"]
-        assert "rover and station have the same messages of /odom 1.20 s apart" in note
+        assert "two recorders have the same messages of /odom 1.2 s apart" in note
         path = asked(memory, "trajectory_summary", **WINDOW)
         assert path["distance_m"] == pytest.approx(expected, abs=0.1)
+        assert str(path["notes"]).count("that of the first") == 1
         drilled = {"topic": "/task", "condition_type": "equals", "value": "drill"}
         visited = asked(memory, "visits", x=0, y=3, radius_m=9, **{"while": drilled})
         assert visited["minutes"] == pytest.approx(16 / 60, abs=0.05)
