@@ -32,6 +32,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import (
     Quoted,
+    counted,
     leaves,
     looks_like_json,
     named,
@@ -85,6 +86,8 @@ if TYPE_CHECKING:
 
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
+_SURE: Final = 0.7
+"""A single detection with this score is hardly an error of the detector."""
 _LEFT_TO_SAY_S: Final = 2.0
 """The part of the call's time that a search leaves for reading the messages of matches."""
 
@@ -315,7 +318,7 @@ def _run_sightings(
     view.notes.retract_outside(searched)
     found = _found_in(view, search, runs, scope, selection.frame_id)
     sightings = _with_fields(view, found, selection.fields)
-    view.notes.add(*_flicker_notes(view, search, runs))
+    view.notes.add(*_flicker_notes(view, search, runs), *_doubtful_notes(runs, sightings))
     return _SelectedRows(total, searched, sightings)
 
 
@@ -507,6 +510,23 @@ def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> It
         yield (
             f"{close} of these sightings end because the detector missed it for less than 3 s: "
             "with by they count as one with the next"
+        )
+
+
+def _doubtful_notes(runs: Sequence[Run], sightings: Sequence[Sighting]) -> Iterator[str]:
+    """Yields that most sightings are one detection of a low score, between messages without it."""
+    lone = {
+        (run.topic, run.last)
+        for run in runs
+        if run.messages == 1 and run.begun and run.until - run.last <= FLICKER_NS
+    }
+    found = ((one.score, (one.topic, one.last)) for one in sightings)
+    scores = [score for score, at in found if score is not None and at in lone]
+    doubtful = [score for score in scores if score < _SURE]
+    if 2 * len(doubtful) > len(sightings):
+        yield (
+            f"{counted(len(doubtful), 'sighting')} of one message alone may be an error of the "
+            f"detector: a min_score above {max(doubtful):.2f} leaves such out"
         )
 
 

@@ -76,6 +76,24 @@ def test_it_is_said_that_a_detector_missed_it_for_a_moment_only(
     assert counts["count"] == 5 - close
 
 
+@pytest.mark.parametrize(("score", "lasts_s", "doubted"), [(0.5, 1, 3), (0.5, 2, 0), (0.9, 1, 0)])
+def test_most_sightings_of_one_message_and_a_low_score_are_called_doubtful(
+    tmp_path: Path, score: float, lasts_s: int, doubted: int
+) -> None:
+    """Else a person was seen every night."""
+    seen = [
+        detections(BEGIN + at * S, ["person"] * (at % 20 < lasts_s), score=score)
+        for at in range(10, 80)
+    ]
+    person = {"topic": OBJECTS, "condition_type": "contains", "value": "person"}
+    found = asked(remembered(tmp_path, seen), "find_matches", **person)
+    assert found["total"] == 3
+    note = "of one message alone may be an error of the detector: a min_score above 0.50 leaves"
+    assert [one.split()[0] for one in found.get("notes", ()) if note in one] == (
+        [str(doubted)] if doubted else []
+    )
+
+
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     seen, limits = [detections(BEGIN, ["cup"], score=0.2)], QuerySettings(min_score=0.5)
     memory = remembered(tmp_path, seen, limits=limits)
