@@ -521,12 +521,11 @@ def _doubtful_notes(runs: Sequence[Run], sightings: Sequence[Sighting]) -> Itera
         if run.messages == 1 and run.begun and run.until - run.last <= FLICKER_NS
     }
     found = ((one.score, (one.topic, one.last)) for one in sightings)
-    scores = [score for score, at in found if score is not None and at in lone]
-    doubtful = [score for score in scores if score < _SURE]
-    if 2 * len(doubtful) > len(sightings):
+    doubtful = sum(score is not None and score < _SURE and at in lone for score, at in found)
+    if 2 * doubtful > len(sightings):
         yield (
-            f"{counted(len(doubtful), 'sighting')} of one message alone may be an error of the "
-            f"detector: a min_score above {max(doubtful):.2f} leaves such out"
+            f"{counted(doubtful, 'sighting')} of one message alone may be an error of the "
+            f"detector: min_score {_SURE:g} leaves such out"
         )
 
 

@@ -88,7 +88,7 @@ def test_most_sightings_of_one_message_and_a_low_score_are_called_doubtful(
     person = {"topic": OBJECTS, "condition_type": "contains", "value": "person"}
     found = asked(remembered(tmp_path, seen), "find_matches", **person)
     assert found["total"] == 3
-    note = "of one message alone may be an error of the detector: a min_score above 0.50 leaves"
+    note = "of one message alone may be an error of the detector: min_score 0.7 leaves such out"
     assert [one.split()[0] for one in found.get("notes", ()) if note in one] == (
         [str(doubted)] if doubted else []
     )
