@@ -113,12 +113,17 @@ class Extremes:
         return max(abs(self.least), abs(self.most))
 
 
+def _times(answer: TopicRange) -> list[Ns]:
+    ends = [sample.time for sample in (*answer.samples[:1], *answer.samples[-1:])]
+    return ends + [at for one in answer.extremes for at in (one.least_at, one.most_at)]
+
+
 def _first_time(answer: TopicRange) -> Ns | None:
-    return answer.samples[0].time if answer.samples else None
+    return min(_times(answer), default=None)
 
 
 def _last_time(answer: TopicRange) -> Ns | None:
-    return answer.samples[-1].time if answer.samples else None
+    return max(_times(answer), default=None)
 
 
 @result(

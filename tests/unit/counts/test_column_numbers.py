@@ -276,3 +276,24 @@ def test_numbers_in_an_object_have_extremes_one_by_one(tmp_path: Path, *, recall
     columns = asked(memory, "get_topic_in_range", **given, by="day")
     [row] = (dict(zip(columns["columns"], row, strict=True)) for row in columns["rows"])
     assert (row["position.x.mean"], row["position.y.min"]) == (2.0, -8.0)
+
+
+def test_extremes_of_a_day_have_local_times_beside_a_single_sample(tmp_path: Path) -> None:
+    """So "how low was it, and when?" takes one call."""
+    levels = [1.0, 0.5, 0.13, 0.9]
+    write(tmp_path, [battery(BEGIN + n * 6 * HOUR * S, level) for n, level in enumerate(levels)])
+    given = {"start": BEGIN // S, "end": BEGIN // S + 24 * HOUR, "fields": ["percentage"]}
+    with in_zone("UTC"):
+        reply = asked(
+            memory_of(tmp_path),
+            "get_topic_in_range",
+            topic="/battery_state",
+            max_samples=1,
+            **given,
+        )
+    [percentage] = reply["extremes"].values()
+    assert (percentage["min_at"], percentage["min_local"]) == (
+        BEGIN // S + 12 * HOUR,
+        "Tue 2026-07-14 15:00:00",
+    )
+    assert (len(reply["rows"]), reply["fields"][-1]) == (1, "local")
