@@ -43,7 +43,8 @@ _Odometry: TypeAlias = "tuple[str, Session | None]"
 """A frame, and the session in which its coordinates hold; None for the map: they always hold."""
 
 _MOST_SPOTS: Final = 150_000
-"""Spots that one estimate compares: a home robot has 50,000 in a week."""
+"""Spots that one estimate compares: a home robot has 50,000 in a week, one that looks around once
+a second day and night 34,000 in a day."""
 _ESTIMATING_S: Final = 6.0
 _FEWER: Final = 4
 """After an estimate that takes longer, the next ones compare a fourth as many spots."""
@@ -254,7 +255,7 @@ class _Loader:
                 f"takes too long; {self._view.bags.filling_progress()}ask again"
             )
         while True:
-            begun_s = time.monotonic()
+            begun_s = time.thread_time()  # a busy machine makes no estimate longer
             try:
                 known = self._things_in(parts, crowded=crowded)
             except _TakesTooLongError:
@@ -263,7 +264,7 @@ class _Loader:
                 parts, crowded = _newest_within(parts, most), True
             else:
                 # Try more the next time.
-                if most < _MOST_SPOTS and time.monotonic() - begun_s < _ESTIMATING_S / _QUICK:
+                if most < _MOST_SPOTS and time.thread_time() - begun_s < _ESTIMATING_S / _QUICK:
                     self._put_most(min(2 * most, _MOST_SPOTS))
                 return replace(known, most=most)
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,6 +11,7 @@ from itertools import chain, count
 from operator import attrgetter
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 from typing import Any, TypeVar
 from unittest.mock import Mock
 
@@ -1275,9 +1277,11 @@ def labels_and_notes(memory: Memory) -> tuple[set[str], list[str]]:
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    crowded = eight_bags(tmp_path)
+    """It is still busy: by the clock each estimate takes ten seconds, but hardly any of its own."""
+    crowded, clock = eight_bags(tmp_path), count(0, 10)
     monkeypatch.setattr(known, "_FEWER", 100)
-    monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
+    busy = SimpleNamespace(monotonic=lambda: next(clock), thread_time=time.thread_time)
+    monkeypatch.setattr(known, "time", busy)
     with monkeypatch.context() as slow:
 
         def of_one(seen: JoinedSights, *others: Any) -> Estimate:
