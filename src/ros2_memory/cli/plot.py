@@ -52,7 +52,7 @@ _MOST_SAMPLES: Final = 20_000
 _MOST_FIELDS: Final = 20
 """Fields of one picture: 300 rows take minutes to lay out."""
 MOST_TOPICS: Final = 200
-"""Rows of topics in one picture: no PNG is as high as 2,500 rows."""
+"""Rows of topics in one picture: one of 2,500 is 88,000 pixels high, which few programs show."""
 _PERIODS: Final = 5
 """A step of a signal that is longer than so many usual ones, and than a second, is a gap."""
 _STYLE: Final = {
