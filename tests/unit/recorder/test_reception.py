@@ -198,10 +198,10 @@ def test_what_a_refused_publisher_sent_is_missing_after_the_clock_was_set_back(
     assert all(loss.start < loss.stop for loss in read_losses(tmp_path, MIN_NS, MAX_NS))
 
 
+@patch.object(reception_module, "_MOST_UNWRITTEN", 2)
 def test_losses_that_wait_too_long_to_be_written_are_dropped_with_a_word(
-    tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, made: Reception
 ) -> None:
-    monkeypatch.setattr(reception_module, "_MOST_UNWRITTEN", 2)
     made.note_refused("a", "/odom")
     made.may_write = False
     with capture_logs() as log:
@@ -229,10 +229,10 @@ def test_a_topic_that_ends_as_the_clock_is_set_back_is_silent(
 
 
 @pytest.mark.parametrize("seconds", [10, 20])
+@patch.object(measure, "SPLIT_BYTES", 1000)
 def test_rates_and_silences_of_huge_splits_are_those_of_all_their_messages(
-    tmp_path: Path, made: Reception, monkeypatch: pytest.MonkeyPatch, seconds: int
+    tmp_path: Path, made: Reception, seconds: int
 ) -> None:
-    monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
     for number in range(4):
         at = T0 + number * seconds * NS
         odometry = [odom(at + tick * NS // 20, 1.0, 2.0) for tick in range(20 * seconds)]
@@ -538,8 +538,8 @@ def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
     counter = LossCounter()
     counter.begin("dead")
     kept = [each for each in range(800) if each != 5]
-    splits = [("live", progress(kept[first : first + 100])) for first in range(0, 799, 100)]
-    assert lost_in(counter, *splits) == [1]
+    splits = [progress(kept[first : first + 100]) for first in range(0, 799, 100)]
+    assert [loss.lost for split in splits for loss in counter.add_split("live", split)] == [1]
 
 
 def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() -> None:
