@@ -246,7 +246,11 @@ def write_splits(
     for number, some in splits_of(messages, split_s).items():
         path = write_mcap(bag_dir / name / f"{name}_{number}.mcap", some, layout)
         if dated:
-            os.utime(path, ns=(some[-1].log_time,) * 2)
+            set_mtime(path, some[-1].log_time)
+
+
+def set_mtime(path: Path, ns: int) -> None:
+    os.utime(path, ns=(ns, ns))
 
 
 def splits_of(messages: Iterable[Msg], split_s: float) -> dict[int, list[Msg]]:

@@ -2,8 +2,9 @@
 
 import asyncio
 import json
+import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -31,7 +32,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies, Reply
-from tests.support.bags import Msg, write_mcap
+from tests.support.bags import Msg, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 
 LAST_WRITTEN = 1_800_000_000 * NS_PER_S
@@ -90,25 +91,25 @@ def memory_of(
     return with_store(memory, bag_dir) if recalls else memory
 
 
-def remembered(bag_dir: Path, messages: Iterable[Msg], **how: Any) -> Memory:
-    """The memory over a bag of these messages; see `memory_of`."""
-    write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
+def remembered(
+    bag_dir: Path, messages: Iterable[Msg], split_s: float = math.inf, **how: Any
+) -> Memory:
+    """The memory over a recording of these messages, in splits of so long; see `memory_of`."""
+    if split_s < math.inf:
+        write_splits(bag_dir, messages, split_s)
+    else:
+        write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
     return memory_of(bag_dir, **how)
 
 
 each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 """Asked of the bags alone, and of columns that are stored."""
+Remember = Callable[..., Memory]
+"""Makes the memory of `tmp_path`, to which it first writes messages as a bag; see `memory_of`."""
 
 
 def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0) -> Memory:
-    """The memory with a store of columns of the first `part` of the closed bags."""
-    return replace(memory, scanner=stored_columns(memory, bag_dir, part=part, share=share))
-
-
-def stored_columns(
-    memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0
-) -> Scanner:
-    """A scanner over a store that has the first `part` of the closed bags.
+    """The memory with a store of columns of the first `part` of the closed bags.
 
     With a `share` of 0 it has none of the columns that may be left out.
     """
@@ -129,12 +130,22 @@ def stored_columns(
             filling.fill(batch, timeline)
     make_fragments(replace(memory, scanner=scanner), filling.whole_since())
     filling.thin()
-    return scanner
+    return replace(memory, scanner=scanner)
 
 
 def asked(memory: Memory, name: str, **given: object) -> Any:
     """The JSON of the reply, be it an error."""
     return json.loads(replied(memory, name, given).text)
+
+
+def noted(reply: Any, words: str) -> list[str]:
+    """The notes of a reply that have some words."""
+    return [note for note in reply.get("notes", ()) if words in note]
+
+
+def clause(topic: str, condition_type: str, value: object, **more: Any) -> dict[str, Any]:
+    """The arguments that state a condition, with others beside them."""
+    return {"topic": topic, "condition_type": condition_type, "value": value, **more}
 
 
 def assert_same_counts(reply: Any, expected: Any, *, of_means: float = 1e-3) -> None:

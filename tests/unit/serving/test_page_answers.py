@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
+from unittest.mock import patch
 
 import httpx2
 import numpy as np
@@ -49,7 +50,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.housekeepers import made_moment
-from tests.support.memories import memory_of, stored_columns, with_store
+from tests.support.memories import memory_of, remembered, with_store
 from tests.unit.analysis.motion.posed import off_line
 from tests.unit.test_positions import fix
 
@@ -170,9 +171,8 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
     draw = Random(7)
     positions = [draw.uniform(-9, 9) for _ in range(60)]
     poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
-    write_splits(tmp_path, poses)
-    plain = memory_of(tmp_path)
-    for asked_of in (plain, replace(plain, scanner=stored_columns(plain, tmp_path))):
+    plain = remembered(tmp_path, poses, split_s=10)
+    for asked_of in (plain, with_store(plain, tmp_path)):
         signal = "/odom:pose.pose.position.x"
         [found] = shown(asked_of, f"last=1000&signal={signal}")["signals"]
         bounds = zip(found["low"], found["mean"], found["high"], strict=True)
@@ -190,7 +190,7 @@ def test_a_plot_has_the_same_points_however_bags_are_cut_and_with_stored_columns
         folder = tmp_path / str(size)
         write_splits(folder, [odom(at, 0.0, 0.0) for at in times], size)
         plain = memory_of(folder)
-        for asked_of in (plain, replace(plain, scanner=stored_columns(plain, folder))):
+        for asked_of in (plain, with_store(plain, folder)):
             query = f"start={BEGIN_S}&end={BEGIN_S + 1200}&signal=/odom:pose.pose.position.x"
             [signal] = shown(asked_of, query)["signals"]
             found.append(signal["t"])
@@ -229,13 +229,10 @@ def test_what_cannot_be_asked_is_refused_with_the_reason(read: Any, query: str, 
         read(QueryParams(query))
 
 
-def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@patch.object(span, "MOST_POINTS", 10)
+def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(tmp_path: Path) -> None:
     zigzag = [odom(BEGIN + n * S, n / 10, n % 2) for n in range(60)]
-    write_mcap(tmp_path / "rec" / "0.mcap", zigzag)
-    monkeypatch.setattr(span, "MOST_POINTS", 10)
-    path = shown(memory_of(tmp_path))["path"]
+    path = shown(remembered(tmp_path, zigzag))["path"]
     assert len(path["t"]) == 10
     assert (path["x"][0], path["x"][-1]) == (0.0, 5.9)
 
@@ -335,39 +332,37 @@ def test_every_message_is_counted_when_it_was_also_where_bags_have_many(
 ) -> None:
     """Ten minutes at 10 Hz, of which the middle 100 s are looked at."""
     monkeypatch.setattr("ros2_memory.serving.page.topics._MOST_TIMES", most_times)
-    write_splits(tmp_path, along_x(BEGIN, 600, hz=10), split_s)
-    query = f"start={BEGIN_S + 250}&end={BEGIN_S + 350}"
-    [row] = topics(memory_of(tmp_path), query)["topics"]
+    memory = remembered(tmp_path, along_x(BEGIN, 600, hz=10), split_s)
+    [row] = topics(memory, f"start={BEGIN_S + 250}&end={BEGIN_S + 350}")["topics"]
     assert sum(row["spoke"]) == pytest.approx(1000, abs=1)
     assert set(row["spoke"]) <= {16, 17}
-    [silent] = topics(memory_of(tmp_path), f"start={BEGIN_S + 0.91}&end={BEGIN_S + 0.99}")["topics"]
+    [silent] = topics(memory, f"start={BEGIN_S + 0.91}&end={BEGIN_S + 0.99}")["topics"]
     assert silent["spoke"] == [0] * 60 or not most_times
 
 
 def test_each_message_counts_once_where_the_type_of_a_topic_changed(tmp_path: Path) -> None:
     said = [boolean(BEGIN + n * S, True, "/x") for n in range(10)]
     said += [text(BEGIN + n * S + S // 2, "on", "/x") for n in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", in_order(said))
+    memory = remembered(tmp_path, in_order(said))
     for around_s in (5, 1800):
         query = f"start={BEGIN_S - around_s}&end={BEGIN_S + 10 + around_s}"
-        [row] = topics(memory_of(tmp_path), query)["topics"]
+        [row] = topics(memory, query)["topics"]
         assert sum(row["spoke"]) == 15
 
 
-def test_topics_are_listed_also_where_there_is_no_time_to_read_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.serving.page.topics._QUICK_S", 0.0)
-    write_splits(tmp_path, [boolean(BEGIN + n * S, True) for n in range(600)], 600)
-    [row] = topics(memory_of(tmp_path), f"start={BEGIN_S}&end={BEGIN_S + 60}")["topics"]
+@patch("ros2_memory.serving.page.topics._QUICK_S", 0.0)
+def test_topics_are_listed_also_where_there_is_no_time_to_read_them(tmp_path: Path) -> None:
+    [row] = topics(
+        remembered(tmp_path, [boolean(BEGIN + n * S, True) for n in range(600)], split_s=600),
+        f"start={BEGIN_S}&end={BEGIN_S + 60}",
+    )["topics"]
     assert (row["numbers"], set(row["spoke"])) == ([], {1})
 
 
 def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
     """Whatever time is looked at, the origin is the same."""
     messages = [fix(BEGIN + n * S, n * 1e-5, n * 1e-5) for n in range(20)]
-    write_splits(tmp_path, messages)
-    plain = memory_of(tmp_path)
+    plain = remembered(tmp_path, messages, split_s=10)
     memory = replace(plain, limits=replace(plain.limits, pose_topic="/fix"))
     whole = shown(memory, "last=1000")
     assert whole["path"]["frame"] == "east and north of 48.123457, 11.765432"
@@ -386,8 +381,7 @@ def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_
 def test_a_receiver_that_began_without_satellites_has_a_path(tmp_path: Path) -> None:
     inside = [fix(BEGIN + n * S // 10, 0.0, 0.0, -1) for n in range(1100)]
     outside = [fix(BEGIN + n * S // 10, n * 1e-6, 0.0) for n in range(1100, 1400)]
-    write_splits(tmp_path, [*inside, *outside])
-    plain = memory_of(tmp_path)
+    plain = remembered(tmp_path, [*inside, *outside], split_s=10)
     memory = replace(plain, limits=replace(plain.limits, pose_topic="/fix"))
     window = TimeWindow(BEGIN, BEGIN + 140 * S)
     found: Any = path_in_box(memory, Call(), window, Box(-100, -100, 100, 100, 0.5))
@@ -412,6 +406,10 @@ def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: 
     assert labels(0, 5) == {}
 
 
+def moment(memory: Memory, query: str) -> Any:
+    return received(moment_reply(QueryParams(query), memory, Call()))
+
+
 def test_sightings_are_of_the_label_in_its_spellings_and_of_no_longer_word(tmp_path: Path) -> None:
     """A thing has one name for all spellings; `cup` is no part of `cupboard`."""
     seen = ["cup", "cupboard", "Cups", "coffee_mug", "0", "10"]
@@ -419,10 +417,9 @@ def test_sightings_are_of_the_label_in_its_spellings_and_of_no_longer_word(tmp_p
         detections(BEGIN + n * S, [seen[n // 20]] if n % 20 < 5 else [])
         for n in range(20 * len(seen))
     ]
-    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    memory = remembered(tmp_path, messages)
     for label, begins in (("cup", [40, 0]), ("coffee mug", [60]), ("0", [80])):
-        query = QueryParams(f"label={label}&start={BEGIN_S - 1}&end={BEGIN_S + 200}")
-        found = received(moment_reply(query, memory, Call()))
+        found = moment(memory, f"label={label}&start={BEGIN_S - 1}&end={BEGIN_S + 200}")
         assert [row["first_seen"] - BEGIN_S for row in found["sightings"]] == begins
         assert found["total"] == len(begins)
 
@@ -432,9 +429,7 @@ def test_what_was_seen_has_each_label_once_however_often_another_one_was(tmp_pat
     seen = ["person" if n % 45 < 15 else "" for n in range(80 * 45)]
     seen[40 * 45 + 26 : 40 * 45 + 28] = ["cup", "cup"]
     messages = [detections(BEGIN + n * S, [label] * bool(label)) for n, label in enumerate(seen)]
-    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
-    query = QueryParams(f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
-    found = received(moment_reply(query, memory, Call()))
+    found = moment(remembered(tmp_path, messages), f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
     rows = [(row["label"], row["t"] - BEGIN_S, row["end"] - BEGIN_S) for row in found["seen"]]
     assert rows == [("person", 0, 14), ("cup", 1826, 1827)]
 
@@ -444,20 +439,16 @@ def test_sightings_take_no_place_of_what_happened_in_a_stretch(tmp_path: Path) -
     seen = ["person" if n % 45 < 15 else "" for n in range(40 * 45)]
     messages = [detections(BEGIN + n * S, [label] * bool(label)) for n, label in enumerate(seen)]
     messages += [boolean(BEGIN + n * S, n // 30 % 2 == 1) for n in range(40 * 45)]
-    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
-    query = QueryParams(f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
-    found = received(moment_reply(query, memory, Call()))
+    found = moment(remembered(tmp_path, messages), f"start={BEGIN_S}&end={BEGIN_S + len(seen)}")
     assert {row["kind"] for row in found["events"]} == {"flip"}
     assert len(found["events"]) == 59
     assert not [note for note in found["notes"] if "too many" in note]
 
 
-def test_a_note_says_where_labels_were_in_view_too_often_to_list_each_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(topic_events, "MAX_INTERVALS", 10)
+@patch.object(topic_events, "MAX_INTERVALS", 10)
+def test_a_note_says_where_labels_were_in_view_too_often_to_list_each_time(tmp_path: Path) -> None:
     messages = [detections(BEGIN + n * S, ["cup"] * (n % 10 < 2)) for n in range(300)]
-    memory = memory_of(write_mcap(tmp_path / "a.mcap", messages).parent)
+    memory = remembered(tmp_path, messages)
     window = TimeWindow(BEGIN, BEGIN + 300 * S)
     found = received(labels_shown(memory, Call(), window))
     assert found["labels"][0]["sightings"] == 10
@@ -465,15 +456,12 @@ def test_a_note_says_where_labels_were_in_view_too_often_to_list_each_time(
     assert note.endswith("changes too often to list each change: 20 more")
 
 
-def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(drawn_path, "MOST_POINTS", 400)
+@patch.object(drawn_path, "MOST_POINTS", 400)
+def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(tmp_path: Path) -> None:
     angles = np.arange(126 * 8) * 0.05  # eight laps of a circle of 1 m
     poses = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
     messages = [odom(BEGIN + n * S // 20, x, y) for n, (x, y) in enumerate(poses.tolist())]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, messages, split_s=10)
     window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
     assert 100 < len(found["x"]) <= 400
