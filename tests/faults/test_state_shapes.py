@@ -62,7 +62,7 @@ def world(root: Path) -> Path:
         name = bags.begin(600 * nth)
         own.begin(name)
         begun = 600 * nth
-        bags.split(name, [mode(begun - 2, value=False), *words(begun, begun + 10)])
+        bags.split([mode(begun - 2, value=False), *words(begun, begun + 10)])
         own.complete(name)
         made.append(name)
         if nth < 2:

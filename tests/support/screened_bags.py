@@ -93,7 +93,11 @@ class ScreenedBags:
         self.live.add(name)
         return name
 
-    def split(self, name: str, messages: Iterable[Msg], layout: McapLayout | None = None) -> Path:
+    def split(
+        self, messages: Iterable[Msg], layout: McapLayout | None = None, *, of: str | None = None
+    ) -> Path:
+        """Writes and closes a split: of the newest recording, which begins if there is none."""
+        name = of or next(reversed(self._splits), None) or self.begin(0)
         path = self.bag_dir / name / f"{name}_{self._splits[name]}.mcap"
         self._splits[name] += 1
         beside = path.with_name(".being_written")

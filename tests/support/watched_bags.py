@@ -124,8 +124,8 @@ class WatchedBags:
         return name
 
     def split(self, messages: Iterable[Msg], name: str | None = None, **layout: Any) -> Path:
-        """Writes and closes a split of the newest recording."""
-        recording = name or self.names[-1]
+        """Writes and closes a split of the newest recording, which begins if there is none."""
+        recording = name or (self.names[-1] if self.names else self.begin(T0))
         path = self.bag_dir / recording / f"{recording}_{self._splits}.mcap"
         self._splits += 1
         written = write_mcap(path, messages, **layout)

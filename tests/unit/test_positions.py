@@ -716,7 +716,7 @@ def test_a_pose_that_a_rare_correction_of_the_map_does_not_reach_yet_gives_way_t
     refused = ask(timestamp=T0_S + 4.95, tolerance_s=0.3)
     assert "no transform" in refused["detail"]
     assert "ask with tolerance_s of at least 0.4" in refused["detail"]
-    by_default = [{}] if topic == "/odom" else []
+    by_default: list[dict[str, float]] = [{}] if topic == "/odom" else []
     for tolerance in [{"tolerance_s": 0.45}, *by_default]:
         found = ask(timestamp=T0_S + 4.95, **tolerance)
         assert (found["timestamp"], found["x"]) == (T0_S + 4.55, pytest.approx(7.55))

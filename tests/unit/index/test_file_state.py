@@ -1,6 +1,5 @@
 """How a bag file stands, and files that the recorder holds back: no index serves these."""
 
-import os
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -27,7 +26,7 @@ from ros2_memory.index.scan import Stamp
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.instructions import instructions
-from tests.support.bags import McapLayout
+from tests.support.bags import McapLayout, set_mtime
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
@@ -74,7 +73,7 @@ class RepeatedScan:
     ) -> FileState:
         """The state at `now`, first giving the file an mtime; `names`: a live heartbeat."""
         if age_s is not None:
-            os.utime(path, ns=(now - round(age_s * S),) * 2)
+            set_mtime(path, now - round(age_s * S))
         stamp = Stamp.of(path.lstat())
         if self.notes is None:
             self.notes = FileNotes.first(str(path), stamp, now)
@@ -221,18 +220,18 @@ def test_a_split_is_found_once_it_is_released(tmp_path: Path, include_active: bo
     bags = ScreenedBags(tmp_path / "bags")
     index = index_of(bags, include_active=include_active)
     name = bags.begin(0)
-    bags.split(name, [mode(-2, value=False), *words(0, 10)])
-    growing = bags.split(name, words(10, 20), OPEN)
+    bags.split([mode(-2, value=False), *words(0, 10)])
+    growing = bags.split(words(10, 20), OPEN)
     assert found_names(index.snapshot()) == []
     assert [(each.path.name, each.reason, each.answers) for each in index.snapshot().active] == [
         (f"{name}_{n}.mcap", HELD_BACK, False) for n in range(2)
     ]
     growing.unlink()
-    bags.split(name, words(20, 30))
+    bags.split(words(20, 30))
     bags.step()
     assert found_names(index.snapshot()) == [f"{name}_0.mcap"]
     # What a crash left open is not served either: only the recorder repairs it.
-    bags.split(name, words(30, 40), OPEN)
+    bags.split(words(30, 40), OPEN)
     bags.end()
     assert found_names(index.snapshot()) == [f"{name}_{n}.mcap" for n in (0, 2)]
 
@@ -243,7 +242,7 @@ def test_what_is_announced_while_a_directory_is_read_is_held_back(
     bags = ScreenedBags(tmp_path / "bags")
     index = index_of(bags, include_active=True)
     context = index._context  # type: ignore[attr-defined]
-    slow = Mock(side_effect=lambda: (context(), bags.split(bags.begin(0), words(0, 10)))[0])
+    slow = Mock(side_effect=lambda: (context(), bags.split(words(0, 10)))[0])
     monkeypatch.setattr(index, "_context", slow)
     assert found_names(index.snapshot()) == []
 
@@ -251,8 +250,8 @@ def test_what_is_announced_while_a_directory_is_read_is_held_back(
 def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
     name = bags.begin(0)
-    bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
-    bags.split(name, words(10, 20))
+    bags.split([mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+    bags.split(words(10, 20))
     held_back = "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
     assert nothing_here(index_of(bags).snapshot()) == held_back
     limits = QuerySettings(kept=RetentionLimits(10**9, 0))
@@ -277,7 +276,7 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
 
 def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
-    bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
+    bags.split([mode(-2, value=False), *words(0, 10)])
     limits = QuerySettings(screened=True, include_active=True, kept=RetentionLimits(10**9, 0))
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 12 * S), limits=limits)
     at = {"topic": "/chatter", "timestamp": T0 // S + 5}

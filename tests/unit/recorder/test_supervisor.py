@@ -106,10 +106,8 @@ def test_what_is_excluded_of_latched_topics_is_not_asked_for_by_the_next_recordi
     assert [call.args[0] for call in skipped.mock_calls] == [(), {"/map"}, ()]
 
 
-def test_a_topic_that_went_away_does_not_hold_a_rotation_up_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+@patch.object(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+def test_a_topic_that_went_away_does_not_hold_a_rotation_up_for_ever(tmp_path: Path) -> None:
     world = rotating(tmp_path, 19)
     world.defaults = {"topics": ("/bumper",)}
     [said] = world.logged(12.25, "rotated_without")
@@ -437,8 +435,8 @@ def test_topics_that_nobody_offers_are_named_once_a_recorder_has_looked(tmp_path
     assert world.heartbeat()["missing"] == ["/gone"]
 
 
-def test_nodes_that_have_gone_are_reported(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+@patch.object(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+def test_nodes_that_have_gone_are_reported(world: World) -> None:
     world.run(9)
     world.silent, world.defaults = True, {"topics": ()}
     [said] = world.logged(90, "topic_silent")
@@ -711,8 +709,8 @@ def test_what_a_crash_left_open_is_repaired_and_then_screened(tmp_path: Path) ->
     bags = ScreenedBags(tmp_path / "bags")
     house = keeper_of(bags.bag_dir, screening=bags.screening)
     name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 10)])
-    bags.split(name, words(10, 20), OPEN)
+    bags.split([off(-2), *words(0, 10)])
+    bags.split(words(10, 20), OPEN)
     bags.end()
     assert len(bags.served()) == 1
     assert bags.screening.problem() is None
@@ -721,14 +719,12 @@ def test_what_a_crash_left_open_is_repaired_and_then_screened(tmp_path: Path) ->
     assert [path.name for path in bags.served()] == [f"{name}_{n}.mcap" for n in range(2)]
 
 
-def test_the_budget_may_delete_what_is_held_back_in_a_recording_that_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(McapWriter, "cut", failing())
+@patch.object(McapWriter, "cut", failing())
+def test_the_budget_may_delete_what_is_held_back_in_a_recording_that_ended(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
     name = bags.begin(0)
-    held = bags.split(name, [on(0), *words(0, 10)])
-    bags.split(name, [off(13), *words(10, 30)])
+    held = bags.split([on(0), *words(0, 10)])
+    bags.split([off(13), *words(10, 30)])
     bags.end()
     recording_now(bags.bag_dir, name)
     keeper_of(bags.bag_dir, max_bytes=1).apply()
@@ -741,8 +737,7 @@ def test_the_budget_may_delete_what_is_held_back_in_a_recording_that_ended(
 def test_a_step_runs_in_the_background_and_its_fault_is_reported(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
     house = keeper_of(bags.bag_dir, background=Background(), screening=bags.screening)
-    name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 10)])
+    bags.split([off(-2), *words(0, 10)])
     house.screen(())
     house.wait()
     assert len(bags.served()) == 1

@@ -84,7 +84,7 @@ def test_of_the_next_simulation_nothing_is_excluded_by_the_times_of_the_last(
     for begin, mode in ((0, on(0)), (3600, off(0))):  # by the wall clock
         clear_bags(tmp_path)
         bags = ScreenedBags(tmp_path)
-        bags.split(bags.begin(begin), [mode, *words(0, 5)])
+        bags.split([mode, *words(0, 5)], of=bags.begin(begin))
         bags.end()
     assert bags.seconds() == [0.5, 1.5, 2.5, 3.5, 4.5]
 

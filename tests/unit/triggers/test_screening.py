@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given
@@ -43,15 +44,12 @@ def halves(begin: int, stop: int) -> list[float]:
     return [n + 0.5 for n in range(begin, stop)]
 
 
-def test_what_was_excluded_long_ago_is_neither_never_nor_a_gap(
-    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(screening, "MOST_EXCLUDED", 3)
-    name = bags.begin(0)
+@patch.object(screening, "MOST_EXCLUDED", 3)
+def test_what_was_excluded_long_ago_is_neither_never_nor_a_gap(bags: ScreenedBags) -> None:
     for begin in range(0, 160, 20):
         around = [*map(off, range(begin, begin + 9)), *map(off, range(begin + 13, begin + 20))]
         said = [*around, on(begin + 10), off(begin + 12), *words(begin, begin + 20)]
-        bags.split(name, sorted(said, key=lambda message: message.log_time))
+        bags.split(sorted(said, key=lambda message: message.log_time))
         bags.step()
     bags.end()
     memory, begun = memory_of(bags.bag_dir), T0 / S
@@ -64,17 +62,17 @@ def test_what_was_excluded_long_ago_is_neither_never_nor_a_gap(
 
 
 def test_a_recording_from_before_is_left_alone(bags: ScreenedBags) -> None:
-    name = bags.begin(0)
+    bags.begin(0)
     (bags.bag_dir / SCREENED_FILE).unlink()
     bags.screening = bags.new()
-    bags.split(name, [on(0), *words(0, 10)])
+    bags.split([on(0), *words(0, 10)])
     bags.step()
     assert bags.seconds() == halves(0, 10)
 
 
 def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
     said = [*map(off, range(5)), *words(0, 10)]
-    bags.split(bags.begin(0), said, McapLayout(latched=frozenset()))
+    bags.split(said, McapLayout(latched=frozenset()))
     bags.end()
     assert bags.seconds() == halves(0, 6)
 
@@ -87,13 +85,12 @@ def test_what_other_nodes_report_does_not_end_what_one_excludes(
     private = parse_condition("contains", "private", 0.5)
     camera = privacy(topic="/diagnostics", condition=private, margin=0)
     bags = ScreenedBags(tmp_path / "bags", camera)
-    name = bags.begin(0)
     for begin in (0, 10):
         said = words(begin, begin + 10)
         for second in range(begin, begin + 10):
             at, state = T0 + second * S, "private" if 5 <= second < 15 else "open"
             said += [diagnostics(at, camera=(0, state)), diagnostics(at + 1000, lidar=(0, "fine"))]
-        bags.split(name, said, layout)
+        bags.split(said, layout)
         bags.step()
     bags.end()
     assert bags.seconds() == [*halves(0, 5), *halves(15, 20)]
@@ -102,12 +99,11 @@ def test_what_other_nodes_report_does_not_end_what_one_excludes(
 def test_a_split_is_held_back_while_a_late_message_may_exclude_its_end(tmp_path: Path) -> None:
     """Messages come up to a second late, and a margin of a second before them is excluded."""
     bags = ScreenedBags(tmp_path / "bags", privacy(), privacy(name="without margin", margin=0))
-    name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 10)])
-    bags.split(name, words(10, 12))
+    bags.split([off(-2), *words(0, 10)])
+    bags.split(words(10, 12))
     bags.step()
     assert bags.seconds() == []
-    bags.split(name, [on(10.5), word(11.6)])
+    bags.split([on(10.5), word(11.6)])
     bags.step()
     assert bags.seconds() == halves(0, 9)
 
@@ -123,7 +119,7 @@ def test_a_split_is_held_back_while_a_late_message_may_exclude_its_end(tmp_path:
 def test_a_message_that_cannot_show_it_is_unknown_and_reported(
     bags: ScreenedBags, said: Msg, problem: str
 ) -> None:
-    bags.split(bags.begin(0), [off(-2), said, *words(0, 10)])
+    bags.split([off(-2), said, *words(0, 10)])
     bags.end()
     assert bags.seconds() == halves(0, 4)
     assert problem in (bags.screening.problem() or "")
@@ -142,7 +138,7 @@ def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected
     bags = ScreenedBags(tmp_path / "bags", rule("pose.position.x"))
     with capture_logs() as logs:
         for name, begin in ((bags.begin(0), 0), (bags.begin(1), 10), (bags.begin(20), 20)):
-            bags.split(name, [*driven(begin, begin + 10), *words(begin, begin + 10)])
+            bags.split([*driven(begin, begin + 10), *words(begin, begin + 10)], of=name)
             bags.step()
         bags.end()
     assert bags.served() == []
@@ -166,11 +162,11 @@ def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected
 
 def test_what_holds_at_the_end_holds_after_a_restart(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=False))
-    bags.split(bags.begin(0), [on(2), *words(0, 10)])
+    bags.split([on(2), *words(0, 10)])
     bags.end()
     bags.screening = bags.new()
     new = bags.begin(30)
-    bags.split(new, [off(32), *words(30, 40)])
+    bags.split([off(32), *words(30, 40)])
     metadata = bags.bag_dir / new / METADATA_FILE
     metadata.write_text("")
     bags.end()
@@ -178,22 +174,22 @@ def test_what_holds_at_the_end_holds_after_a_restart(tmp_path: Path) -> None:
     assert "message_count: 7" in metadata.read_text()
 
 
+@patch.object(screening, "MOST_EXCLUDED", 3)
 def test_a_latched_message_that_was_excluded_long_ago_does_not_come_back(
-    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+    bags: ScreenedBags,
 ) -> None:
-    monkeypatch.setattr(screening, "MOST_EXCLUDED", 3)
     maps = [word(1, "/map"), word(6, "/map")]
     name = bags.begin(0)
-    bags.split(name, [off(0), *maps[:1], on(5), *maps[1:], off(8), *words(0, 10)])
+    bags.split([off(0), *maps[:1], on(5), *maps[1:], off(8), *words(0, 10)])
     for begin in range(10, 120, 10):
         before, name = name, bags.begin(begin)
         bags.end(before)
-        bags.split(name, [off(begin), on(begin + 3), off(begin + 6), *words(begin, begin + 10)])
+        bags.split([off(begin), on(begin + 3), off(begin + 6), *words(begin, begin + 10)])
         bags.step()
     before, name = name, bags.begin(120)
     bags.end(before)
     again = [replace(each, log_time=T0 + 121 * S, publish_time=each.log_time) for each in maps]
-    bags.split(name, [off(120), *again, off(121), *words(121, 130)])
+    bags.split([off(120), *again, off(121), *words(121, 130)])
     bags.end()
     assert bags.seconds("/map") == [1.0, 121.0]
 
@@ -202,20 +198,19 @@ def test_a_latched_message_that_was_excluded_long_ago_does_not_come_back(
 def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(
     bags: ScreenedBags, *, flushes: bool
 ) -> None:
-    name = bags.begin(0)
     # Nothing is known of the mode yet: what the next recording receives again may be served.
-    bags.split(name, [word(1, "/map"), *words(0, 10)])
-    bags.split(name, [off(12), *words(10, 20)])
+    bags.split([word(1, "/map"), *words(0, 10)])
+    bags.split([off(12), *words(10, 20)])
     bags.step()
     assert bags.screening.excluded_latched() == set()
-    bags.split(name, [on(22), word(25, "/map"), *words(20, 30)])
-    bags.split(name, [off(32), *words(30, 40)])
-    bags.split(name, words(40, 50))
+    bags.split([on(22), word(25, "/map"), *words(20, 30)])
+    bags.split([off(32), *words(30, 40)])
+    bags.split(words(40, 50))
     with nullcontext() if flushes else broken(repair, "flush", errno.EIO):
         bags.step()
     assert bags.screening.excluded_latched() == {"/map"}
     assert bags.screening.problem() is None
-    bags.split(name, [word(55, "/map"), *words(50, 60)])
+    bags.split([word(55, "/map"), *words(50, 60)])
     bags.end()
     assert bags.screening.excluded_latched() == set()
     assert bags.seconds("/map") == [55.0]
@@ -223,9 +218,9 @@ def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(
 
 def test_a_split_that_cannot_be_read_stays_held_back(bags: ScreenedBags) -> None:
     name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 10)])
-    spoil_chunk(bags.split(name, [on(12), *words(10, 20)]), 0)
-    bags.split(name, words(20, 30))
+    bags.split([off(-2), *words(0, 10)])
+    spoil_chunk(bags.split([on(12), *words(10, 20)]), 0)
+    bags.split(words(20, 30))
     bags.end()
     # Since it may have said that the condition holds, the next one is unknown.
     assert bags.seconds() == halves(0, 9)
@@ -237,9 +232,9 @@ def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
     bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 10)])
-    bad = bags.split(name, [off(10), *words(10, 20)])
-    bags.split(name, [off(20), *words(20, 30)])
+    bags.split([off(-2), *words(0, 10)])
+    bad = bags.split([off(10), *words(10, 20)])
+    bags.split([off(20), *words(20, 30)])
     fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
     fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
     bags.live.clear()
@@ -255,7 +250,7 @@ def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
 
 def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(bags: ScreenedBags) -> None:
     name = bags.begin(0)
-    bags.split(name, [off(0), on(2), *words(0, 10)])
+    bags.split([off(0), on(2), *words(0, 10)])
     theirs = write_mcap(bags.bag_dir / name / "theirs_0.mcap", words(0, 10))
     before = theirs.read_bytes()
     bags.end()
@@ -268,7 +263,7 @@ def test_a_full_disk_or_a_state_that_cannot_be_read_changes_and_serves_nothing(
     bags: ScreenedBags,
 ) -> None:
     name = bags.begin(0)
-    split = bags.split(name, [off(-2), on(5), *words(0, 10)])
+    split = bags.split([off(-2), on(5), *words(0, 10)])
     before = split.read_bytes()
 
     with broken(SCREENED, "write"):
@@ -295,11 +290,10 @@ def test_a_full_disk_or_a_state_that_cannot_be_read_changes_and_serves_nothing(
 
 
 def test_a_clock_that_is_set_back_leaves_nothing_sure(bags: ScreenedBags) -> None:
-    name = bags.begin(0)
-    bags.split(name, [off(-2), *words(0, 30)])
-    bags.split(name, [on(12), *words(10, 20)])
-    bags.split(name, words(15, 25))
-    bags.split(name, words(40, 50))
+    bags.split([off(-2), *words(0, 30)])
+    bags.split([on(12), *words(10, 20)])
+    bags.split(words(15, 25))
+    bags.split(words(40, 50))
     bags.end()
     # It held from 12 s on by one of the two clocks, and is not known to have ended.
     assert bags.seconds() == halves(0, 9)
@@ -307,9 +301,9 @@ def test_a_clock_that_is_set_back_leaves_nothing_sure(bags: ScreenedBags) -> Non
 
 def test_a_recording_that_never_began_is_forgotten(bags: ScreenedBags) -> None:
     failed, name = bags.begin(0), bags.begin(1)
-    bags.split(name, [off(1), *words(2, 10)])
+    bags.split([off(1), *words(2, 10)])
     bags.live.discard(failed)
-    bags.split(name, words(10, 20))
+    bags.split(words(10, 20))
     bags.step()
     assert len(bags.served()) == 1
     state = SCREENED.read(bags.bag_dir)
@@ -352,19 +346,19 @@ def interrupted_at(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
 def record_a_day(bags: ScreenedBags, step: Callable[[], None]) -> None:
     """Two recordings with a rotation while it holds, screened now and then."""
     old = bags.begin(0)
-    bags.split(old, [off(-2), word(1, "/map"), *words(0, 4)])
+    bags.split([off(-2), word(1, "/map"), *words(0, 4)])
     step()
-    bags.split(old, [on(5), *words(4, 8)])
+    bags.split([on(5), *words(4, 8)])
     step()
     new = bags.begin(7)
-    bags.split(old, words(8, 10))
+    bags.split(words(8, 10), of=old)
     bags.live.discard(old)
-    bags.split(new, [on(8.2, published=5), word(8.4, "/map"), *words(8, 12)])
+    bags.split([on(8.2, published=5), word(8.4, "/map"), *words(8, 12)])
     step()
-    bags.split(new, [off(13), *words(12, 20)])
+    bags.split([off(13), *words(12, 20)])
     step()
     step()
-    bags.split(new, [word(21, "/map"), *words(20, 24)])
+    bags.split([word(21, "/map"), *words(20, 24)])
     bags.live.discard(new)
     for _ in range(4):
         step()
@@ -422,10 +416,9 @@ def test_however_a_recording_is_cut_into_splits(
     ]
     messages = sorted([word(0), *words(0, 20), *modes], key=lambda each: each.log_time)
     bags = ScreenedBags(tmp_path_factory.mktemp("bags") / "bags")
-    name = bags.begin(0)
     cuts = [at for at in range(1, len(messages)) if (seed >> (at % 24)) & 7 == 1]
     for start, stop in itertools.pairwise([0, *cuts, len(messages)]):
-        bags.split(name, messages[start:stop])
+        bags.split(messages[start:stop])
         if seed & (1 << (start % 24)):
             bags.step()
     bags.end()

@@ -41,7 +41,6 @@ def fail_to_summarize(monkeypatch: pytest.MonkeyPatch, *bags: Path) -> None:
 
 
 def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
-    robot.begin(T0)
     robot.split(seconds(0, 8, {1, 7}))
     robot.close_all(60)
     [moment] = robot.moments()
@@ -51,7 +50,6 @@ def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
 
 
 def test_a_later_match_extends_a_moment_that_is_stored(robot: WatchedBags) -> None:
-    robot.begin(T0)
     robot.drive(10, {6})
     robot.split(seconds(10, 20, {11}))
     robot.split(seconds(20, 30))
@@ -63,7 +61,6 @@ def test_a_later_match_extends_a_moment_that_is_stored(robot: WatchedBags) -> No
 
 
 def test_a_rule_begins_with_what_is_recorded_from_now_on(robot: WatchedBags) -> None:
-    robot.begin(T0)
     robot.split(seconds(0, 10, {6}))
     robot.beat(state=RecorderState.STOPPED)
     (robot.bag_dir / TRIGGERS_FILE).unlink()
@@ -91,7 +88,6 @@ def test_adopted_bags_fire_nothing_and_the_recording_beside_them_does(robot: Wat
 
 
 def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
-    robot.begin(T0)
     said = replace(flag(5, True), publish_time=T0 + 5 * S - 1)
     # Nor does what was published long before.
     old = replace(flag(1, True), publish_time=T0 - 60 * S)
@@ -134,7 +130,6 @@ def test_a_topic_that_falls_silent_fires_and_a_recorder_that_was_off_is_no_silen
     tmp_path: Path,
 ) -> None:
     robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
-    robot.begin(T0)
     robot.split(seconds(0, 10))
     robot.beat(state=RecorderState.STOPPED)
     robot.look()
@@ -175,7 +170,6 @@ def test_that_a_topic_is_not_recorded_hides_no_other_problem_of_its_rule(tmp_pat
 
 def test_a_recording_that_ended_unasked_and_a_recorder_that_was_killed(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule("restart", **RESTART))
-    robot.begin(T0)
     robot.split(seconds(0, 10))
     robot.clock.at = T0 + 9 * S
     robot.house.note_restart(T0 + 8 * S, "died")
@@ -200,7 +194,6 @@ def test_of_a_long_restart_its_two_ends_are_saved_whatever_other_clocks_date_bet
     tmp_path: Path,
 ) -> None:
     robot = watched(tmp_path, rule("restart", **RESTART))
-    robot.begin(T0)
     for begin in range(0, 60, 10):
         robot.split(seconds(begin, begin + 10))
     robot.beat(state=RecorderState.STOPPED)
@@ -228,7 +221,6 @@ def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
     noisy = rule("noisy", before=0, after=0, max_bytes=6_000)
     quiet = rule("quiet", topic="/door", max_bytes=6_000)
     robot = watched(tmp_path, noisy, quiet, moments_bytes=12_000)
-    robot.begin(T0)
     for begin in range(0, 100, 10):
         doors = [flag(begin + n + 0.5, begin + n == 95, "/door") for n in range(10)]
         robot.split([*seconds(begin, begin + 10, range(5, 100, 10)), *doors])
@@ -247,7 +239,6 @@ def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
 
 def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=0, after=0, max_per_hour=3))
-    robot.begin(T0)
     robot.drive(60, range(0, 60, 2))
     robot.close_all()
     record = robot.record()
@@ -258,7 +249,6 @@ def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
 
 def test_moments_that_are_refused_for_their_size_do_not_count_in_the_hour(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(max_bytes=1, max_per_hour=2))
-    robot.begin(T0)
     robot.drive(100, {5, 35, 65, 95})
     robot.close_all()
     record = robot.record()
@@ -267,7 +257,6 @@ def test_moments_that_are_refused_for_their_size_do_not_count_in_the_hour(tmp_pa
 
 
 def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> None:
-    robot.begin(T0)
     for begin in range(0, 4000, 1000):
         robot.split([flag(n, True) for n in range(begin, begin + 1000, 8)])
         robot.look()
@@ -278,7 +267,6 @@ def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> No
 
 def test_age_deletes_nothing_that_a_rule_may_need(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=50 * S), max_age_h=20 / 3600)
-    robot.begin(T0)
     splits = robot.drive(100)
     robot.look(100)
     robot.look()
@@ -289,7 +277,6 @@ def test_age_deletes_nothing_that_a_rule_may_need(tmp_path: Path) -> None:
 def test_a_match_that_takes_long_keeps_the_bags_in_which_it_began(tmp_path: Path) -> None:
     lasting = rule(before=2 * S, hold=60 * S)
     robot = watched(tmp_path, lasting, max_age_h=5 / 3600)
-    robot.begin(T0)
     for begin in range(0, 100, 10):
         robot.split(seconds(begin, begin + 10, range(20, 100)))
         robot.look(begin + 10)
@@ -300,7 +287,6 @@ def test_a_match_that_takes_long_keeps_the_bags_in_which_it_began(tmp_path: Path
 
 def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
     robot = watched(tmp_path, rule(before=3600 * S), max_bytes=10_000)
-    robot.begin(T0)
     robot.drive(100)
     robot.look()
     assert robot.logged("needed_bags_deleted")
@@ -320,7 +306,6 @@ def test_a_name_that_is_no_utf8_stops_neither_rules_nor_deletion(tmp_path: Path)
 def test_what_happens_after_the_clock_was_set_back_fires_once(
     robot: WatchedBags, back: int
 ) -> None:
-    robot.begin(T0)
     robot.drive(100, {98})
     begin = 100 - back
     robot.drive(begin + 10, first=begin)
@@ -350,7 +335,6 @@ def test_what_version_0_1_0_searched_after_the_clock_was_set_back_is_not_searche
 def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot.begin(T0)
     robot.drive(10)
     bad = robot.split(seconds(10, 20, {15}))
     with monkeypatch.context() as failing:
@@ -367,7 +351,6 @@ def test_a_split_that_cannot_be_read_is_named_and_searched_when_it_can(
 def test_a_split_that_cannot_be_read_is_a_problem_only_until_it_can_be(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch, is_restarted: bool
 ) -> None:
-    robot.begin(T0)
     robot.drive(10)
     with monkeypatch.context() as failing:
         first = robot.split(seconds(10, 20))
@@ -389,7 +372,6 @@ def test_a_split_that_cannot_be_read_is_a_problem_only_until_it_can_be(
 def test_a_split_that_was_deleted_before_it_could_be_read_stays_a_problem(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot.begin(T0)
     robot.drive(10)
     lost = robot.split(seconds(10, 20, {15}))
     fail_to_summarize(monkeypatch, lost)
@@ -407,7 +389,6 @@ def test_a_split_that_was_deleted_before_it_could_be_read_stays_a_problem(
 def test_a_first_split_that_is_readable_late_is_searched_then(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot.begin(T0)
     with monkeypatch.context() as failing:
         first = robot.split(seconds(0, 10, {5}))
         fail_to_summarize(failing, first)
@@ -422,7 +403,6 @@ def test_a_first_split_that_is_readable_late_is_searched_then(
 
 
 def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> None:
-    robot.begin(T0)
     paths = robot.drive(50, {25})
     paths[1].unlink()
     robot.split(seconds(50, 60))
@@ -433,7 +413,6 @@ def test_deleting_what_was_searched_fires_nothing_again(robot: WatchedBags) -> N
 def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
     robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot.begin(T0)
     bad = robot.split(seconds(0, 10, {2}))
     robot.split(seconds(10, 20, {16}))
     robot.clock.at = T0 + 40 * S
@@ -475,7 +454,6 @@ def test_a_state_that_is_damaged_is_said_to_be_lost(tmp_path: Path) -> None:
 
 
 def test_moments_that_cannot_be_stored_are_a_problem_until_they_are(robot: WatchedBags) -> None:
-    robot.begin(T0)
     robot.split(seconds(0, 10, {5}))
     moments = robot.bag_dir / "moments"
     moments.symlink_to(robot.bag_dir.parent)
@@ -489,14 +467,12 @@ def test_moments_that_cannot_be_stored_are_a_problem_until_they_are(robot: Watch
 @pytest.mark.parametrize("field", ["missing", "x"])
 def test_a_condition_that_nothing_can_meet_is_named(tmp_path: Path, field: str) -> None:
     robot = watched(tmp_path, rule(condition=parse_condition("equals", True, 0.5, field)))
-    robot.begin(T0)
     robot.split(seconds(0, 10))
     robot.close_all()
     assert f"'{field}'" in (robot.record().problem or "")
 
 
 def test_messages_that_cannot_be_decoded_are_named(robot: WatchedBags) -> None:
-    robot.begin(T0)
     robot.split(seconds(0, 3), layout=McapLayout(definitions=False))
     robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
     robot.close_all()
