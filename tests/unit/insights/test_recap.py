@@ -38,7 +38,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import in_zone
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, clause, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -61,13 +61,12 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> Non
     ) in over(remembered(tmp_path, many), 0, 10).notes
 
 
-@each_way
 @pytest.mark.parametrize("unit", [1.0, 100.0], ids=["fractions", "percent"])
-def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recalls: bool) -> None:
+def test_a_battery_that_runs_low_is_one_line(remember: Remember, unit: float) -> None:
     """From 25 to 3 % in 220 s, charged to 40 % at 300 s, at 8 % from 400 s on."""
     charges = [*range(250, 30, -1), *([30] * 80), *([400] * 100), *([80] * 50)]
     told = [battery(BEGIN + at * S, of * unit / 1000) for at, of in enumerate(charges)]
-    memory = remembered(tmp_path, told, recalls=recalls)
+    memory = remember(told)
 
     def events(first: int, last: int) -> list[tuple[str, float, float, bool]]:
         return [
@@ -83,8 +82,7 @@ def test_a_battery_that_runs_low_is_one_line(tmp_path: Path, unit: float, recall
     assert ("low batteries", 2) in over(memory, 0, 449).counts
 
 
-@each_way
-def test_two_batteries_on_one_topic_run_low_one_by_one(tmp_path: Path, recalls: bool) -> None:
+def test_two_batteries_on_one_topic_run_low_one_by_one(remember: Remember) -> None:
     told = []
     for second in range(100):
         at, charge = BEGIN + second * S, 0.1605 - second / 1000
@@ -93,7 +91,7 @@ def test_two_batteries_on_one_topic_run_low_one_by_one(tmp_path: Path, recalls: 
             battery(at + 1000, 0.8),
             battery(at + 2000, 0.7, location="in the trailer"),
         ]
-    memory = remembered(tmp_path, told, recalls=recalls)
+    memory = remember(told)
     low = [(event.text, since(event.start)) for event in over(memory, 0, 100).events]
     assert low == [("/battery_state (left) fell below 10%", 61)]
     span = {"start": BEGIN // S, "end": BEGIN // S + 100}
@@ -105,17 +103,15 @@ def test_two_batteries_on_one_topic_run_low_one_by_one(tmp_path: Path, recalls: 
     assert [each["text"] for each in changes] == ["/battery_state (left) fell below 10%"]
 
 
-@each_way
 def test_a_boolean_that_is_true_in_its_first_message_says_how_long_it_was(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     poses = [odom(at(t), 0.4 * t) for t in range(60)]
     flips = [(20, True), (21.2, False), (30, True), (31, False)]
     cliff = [boolean(at(t), is_near, "/cliff") for t, is_near in flips]
     # What is true as the recording begins may have been so for long.
     docked = [boolean(at(t), t < 40, "/docked") for t in range(1, 60)]
-    write_splits(tmp_path, in_order([*poses, *cliff, *docked]))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(in_order([*poses, *cliff, *docked]), split_s=10)
 
     def flipped(begin: float, stop: float) -> list[str]:
         events = asked(memory, "recap", start=T0 + begin, end=T0 + stop)["events"]
@@ -131,15 +127,11 @@ def test_a_boolean_that_is_true_in_its_first_message_says_how_long_it_was(
     assert flipped(29, 39) == ["/cliff became true", "/cliff became false"]
 
 
-@each_way
-def test_an_error_that_comes_again_long_after_is_another_event(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_an_error_that_comes_again_long_after_is_another_event(remember: Remember) -> None:
     """It is reported once a minute twice, in two rooms."""
     often = [log_entry(at(t), 40, "brush", "stalled") for t in (5, 65, 605, 2400, 2460)]
     poses = [odom(at(t), 0.0 if t < 1200 else 5.0) for t in range(0, 2500, 5)]
-    write_splits(tmp_path, in_order([*often, *poses]), 600)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(in_order([*often, *poses]), split_s=600)
     reply = asked(memory, "recap", start=T0, end=T0 + 2500)
     errors = [each for each in reply["events"] if each["text"].startswith("error")]
     assert [(each["text"], each["duration_s"]) for each in errors] == [
@@ -156,9 +148,8 @@ def test_a_battery_without_a_known_charge_is_not_low(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("recordings", [1, 2])
-@each_way
 def test_a_boolean_toggles_not_at_each_message_of_a_time_that_is_recorded_twice(
-    tmp_path: Path, recalls: bool, recordings: int
+    tmp_path: Path, remember: Remember, recordings: int
 ) -> None:
     """It toggles every 50 s; after 300 s the clock is set back by 60, perhaps by a restart."""
     for split in range(20):
@@ -168,7 +159,7 @@ def test_a_boolean_toggles_not_at_each_message_of_a_time_that_is_recorded_twice(
             messages += [odom(at, 0.2 * second), boolean(at + 1, (second // 50) % 2 == 0)]
         number = split * recordings // 20
         write_mcap(tmp_path / f"rec{number}" / f"rec{number}_{split}.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     told = asked(memory, "recap", start=BEGIN / S, end=BEGIN / S + 600)
     flips = [event for event in told["events"] if "became" in event["text"]]
     since = [round(flip["timestamp"] - BEGIN / S) for flip in flips]
@@ -341,8 +332,7 @@ def test_a_thing_that_was_seen_once_in_days_is_listed_beside_what_happens_all_th
         told += [seen(hour, second, label, "chair") for second in range(100, 140, 2)]
     told += [seen(20, second, "deer") for second in range(2000, 2010, 2)]
     told += [seen(20, 2500, "ghost")]
-    write_splits(tmp_path, in_order(told), 3600)
-    told_of = over(memory_of(tmp_path), 0, 3600 * hours)
+    told_of = over(remembered(tmp_path, in_order(told), split_s=3600), 0, 3600 * hours)
     texts = [event.text for event in told_of.events]
     assert [text for text in texts if "view" in text and "cup" not in text.lower()] == (
         ["deer in view"] * is_listed
@@ -442,10 +432,8 @@ ALL = [
 ]
 
 
-@each_way
-def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool) -> None:
-    write_splits(tmp_path, ALL)
-    reply = before(memory_of(tmp_path, recalls=recalls), 43.0)
+def test_what_changed_is_listed_the_nearest_first(remember: Remember) -> None:
+    reply = before(remember(ALL, split_s=10), 43.0)
     assert told(reply) == [
         ("/cmd_vel went to zero while a goal was active", 0.0),
         ("/bumper became true", 0.4),
@@ -470,7 +458,6 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
     assert str(reply["before"]).count("/battery_state fell below 20%") == 1
 
 
-@each_way
 @pytest.mark.parametrize(
     ("charge", "states"),
     [
@@ -480,10 +467,10 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
     ids=["the last percent is no full one", "a fraction after an update is no percent"],
 )
 def test_the_state_of_a_battery_is_its_charge_in_percent(
-    tmp_path: Path, charge: Callable[[int], float], states: dict[int, str], recalls: bool
+    remember: Remember, charge: Callable[[int], float], states: dict[int, str]
 ) -> None:
     charges = [battery(at(t), charge(t)) for t in range(60)]
-    memory = remembered(tmp_path, [*charges, boolean(at(59), True)], recalls=recalls)
+    memory = remember([*charges, boolean(at(59), True)])
     assert {t: before(memory, t)["state"]["/battery_state"] for t in states} == states
 
 
@@ -518,9 +505,8 @@ def test_of_another_run_only_what_a_latched_topic_said_goes_on(
     assert reply["state"] == {"/docked": True} | ({"/drive goal": "active"} if listed_again else {})
 
 
-@each_way
 def test_what_the_first_message_after_a_restart_says_is_no_change(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """It may have been so for long: the robot was off for nine minutes."""
     for name, begin, is_worse in (("first", 0, False), ("second", 600, True)):
@@ -531,7 +517,7 @@ def test_what_the_first_message_after_a_restart_says_is_no_change(
             body += [boolean(at(t), is_worse), command(at(t), vx), goals(at(t), {1: 2})]
         body.append(battery(at(begin + 8.5), 0.04))
         write_splits(tmp_path, body, name=name)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert told(before(memory, 609.0)) == [("/battery_state fell below 5%", 0.5)]
     for start in (0, 600):
         events = asked(memory, "recap", start=T0 + start, end=T0 + 629)["events"]
@@ -543,8 +529,9 @@ def test_a_stop_is_where_the_robot_was_once_it_was_localised_in_it(tmp_path: Pat
     """As after a restart, before the initial pose is known."""
     stood = along_x(BEGIN, 60)
     placed = [tf_of(at(nth), "map", "odom", (7, 2, 0)) for nth in range(40, 60)]
-    write_mcap(tmp_path / "bag.mcap", in_order([*stood, *placed]))
-    reply = asked(memory_of(tmp_path), "recap", start=at(0) / S, end=at(59) / S)
+    reply = asked(
+        remembered(tmp_path, in_order([*stood, *placed])), "recap", start=at(0) / S, end=at(59) / S
+    )
     assert [event["text"] for event in reply["events"]] == ["stood at x 7.00, y 2.00"]
 
 
@@ -582,9 +569,8 @@ def test_what_a_latched_topic_said_is_the_state_also_hours_later_not_a_goal(tmp_
     assert told(before(memory, 7203.0)) == [("/docked became false", 3.0)]
 
 
-@each_way
 def test_what_a_latched_topic_said_as_the_recorder_began_did_not_change_then(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """The recorder receives the newest value, however old it is."""
     layout = McapLayout(latched=frozenset({"/docked"}))
@@ -592,7 +578,7 @@ def test_what_a_latched_topic_said_as_the_recorder_began_did_not_change_then(
         body = along_x(at(start), 60)
         body += [boolean(at(t), value, "/docked") for t, value in said.items()]
         write_splits(tmp_path, body, 1000, f"rec{start}", layout)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     for start in (0, 600):
         events = asked(memory, "recap", start=T0 + start, end=T0 + 659)["events"]
         [docked] = [event for event in events if "/docked" in event["text"]]
@@ -676,7 +662,7 @@ def found_in(
     memory: Memory, condition: str, value: JsonValue, **more: object
 ) -> list[tuple[int, str, float, float]]:
     """The goals that a search finds: number, status, first and last second."""
-    asks = {"topic": TOPIC, "condition_type": condition, "value": value, "limit": 50}
+    asks = clause(TOPIC, condition, value, limit=50)
     found = asked(memory, "find_matches", **asks, **more)["sightings"]
     return [
         (
@@ -700,7 +686,7 @@ def test_a_goal_is_active_from_its_acceptance_to_its_end_in_windows_without_a_st
     memory = memory_of(tmp_path)
 
     def held(word: str, begin: int, end: int) -> object:
-        given = {"topic": TOPIC, "condition_type": "equals", "value": word}
+        given = clause(TOPIC, "equals", word)
         window = {"start": T0 + begin, "end": T0 + end}
         rows = asked(memory, "find_matches", **given, **window)["sightings"]
         by_hour = asked(memory, "find_matches", **given, **window, by="hour")
@@ -743,7 +729,7 @@ def test_while_a_goal_was_executing_is_asked_by_that_word(tmp_path: Path) -> Non
     memory = remembered(tmp_path, in_order(messages))
 
     def bumps(kind: str, word: str | int, **more: object) -> Any:
-        during = {"topic": TOPIC, "condition_type": kind, "value": word} | more
+        during = clause(TOPIC, kind, word) | more
         question = {"topic": "/bump", "condition_type": "equals", "value": True, "while": during}
         reply = asked(memory, "find_matches", **question, oldest_first=True)
         if "error" in reply:
@@ -782,7 +768,7 @@ def test_a_search_for_messages_that_list_goals_says_that_they_list_those_that_en
 
 def test_a_goal_has_the_fields_and_statuses_that_there_are(tmp_path: Path) -> None:
     memory = remembered(tmp_path, DAY)
-    aborted = {"topic": TOPIC, "condition_type": "equals", "value": "aborted"}
+    aborted = clause(TOPIC, "equals", "aborted")
     status = "status_list.1.status"
     goal = asked(memory, "find_matches", **aborted, fields=[status])["sightings"][0]["value"]
     assert (goal["goal"][-1], goal["status"], goal[status]) == ("2", "aborted", 6)
@@ -832,16 +818,15 @@ def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
         assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
 
 
-@each_way
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_a_greatest_speed_that_a_gap_exceeds_has_a_note(
-    tmp_path: Path, recalls: bool, is_lost: bool
+    tmp_path: Path, remember: Remember, is_lost: bool
 ) -> None:
     """It stands, and while it is not localised for a minute it gets 6 m farther."""
     stood = [odom(at(t / 5), 0.0) for t in range(150)]
     lost = [odom(at(30 + t / 5), math.nan) for t in range(300) if is_lost]
     later = [odom(at(90 + t / 5), 6.0) for t in range(50)]
-    memory = remembered(tmp_path, [*stood, *lost, *later], recalls=recalls)
+    memory = remember([*stood, *lost, *later])
     note = "max_speed is of the time with poses alone: across gaps it was 0.10 m/s or more"
     for tool in ("trajectory_summary", "recap"):
         whole = asked(memory, tool, start=T0, end=T0 + 100)

@@ -30,7 +30,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import FixedClock
 from tests.support.examples import LONG
-from tests.support.memories import asked, assert_same_counts, memory_of, with_store
+from tests.support.memories import asked, assert_same_counts, clause, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import MS, write_history
 from tests.unit.things.test_find import KITCHEN, random_messages
@@ -46,10 +46,10 @@ LIMITS: Final = QuerySettings(
 )
 OBJECTS: Final = "/vision/scene/scene_objects"
 BOX: Final[dict[str, Any]] = {"where": {"x": [-1, 1], "y": [-2, 2]}}
-CUPS: Final[dict[str, Any]] = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
-PRESSED: Final[dict[str, Any]] = {"topic": "/bumper", "condition_type": "equals", "value": True}
-SAID: Final[dict[str, Any]] = {"topic": "/chatter", "condition_type": "contains", "value": "cup"}
-UNDOCKED: Final[dict[str, Any]] = {"topic": "/dock", "condition_type": "contains", "value": "un"}
+CUPS: Final[dict[str, Any]] = clause(OBJECTS, "contains", "cup")
+PRESSED: Final[dict[str, Any]] = clause("/bumper", "equals", True)
+SAID: Final[dict[str, Any]] = clause("/chatter", "contains", "cup")
+UNDOCKED: Final[dict[str, Any]] = clause("/dock", "contains", "un")
 NUMBERS: Final = (
     {"topic": "/odom", "fields": ["position.x", "position.z"]},
     {"topic": OBJECTS, "fields": ["objects.score"]},
@@ -266,7 +266,7 @@ def test_messages_that_cannot_be_decoded_are_reported_alike_in_whatever_order_ba
         write_mcap(tmp_path / "rec" / f"rec_{bag}.mcap", messages)
     begin = BEGIN / S
     windows = {"start": begin + 40, "end": begin + 79, "with_start": begin, "with_end": begin + 39}
-    said = {"topic": "/s*", "condition_type": "contains", "value": "hello", "by": "hour"}
+    said = clause("/s*", "contains", "hello", by="hour")
     plain, stored = (memory_of(tmp_path, recalls=recalls) for recalls in (False, True))
     for tool, question in (("compare", windows), ("find_matches", said)):
         notes = asked(plain, tool, **question)["notes"]

@@ -37,7 +37,7 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, each_way, memory_of, noted, remembered
 
 S = 10**9
 T0 = 1_784_000_000
@@ -158,7 +158,7 @@ def test_an_unexpected_end_after_the_newest_data_is_a_doubt_until_more_is_there(
     for until, notes in ((45, []), (60, [sentence])):
         window = {"start": T0 + 40, "end": T0 + until}
         recap = asked(memory, "recap", **window)
-        assert [note for note in recap.get("notes", ()) if after in note] == notes
+        assert noted(recap, after) == notes
     messages = along_x(BEGIN + 55 * S, 5)
     write_mcap(tmp_path / "later" / "later_0.mcap", messages)
     memory.index.refresh()
@@ -171,7 +171,7 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
     for start, count in ((0, 1), (12, 0), (25, 6)):
         window = {"start": T0 + start, "end": T0 + start + 15}
         found = asked(memory, "get_topic_in_range", topic="/odom", **window)
-        notes = [note for note in found.get("notes", ()) if "lost" in note]
+        notes = noted(found, "lost")
         assert [int(note[0]) for note in notes] == [count] * bool(count)
     asks = {"start": T0, "end": T0 + 20, "with_start": T0 + 21, "with_end": T0 + 45}
     notes = asked(memory, "compare", **asks)["notes"]
@@ -411,14 +411,12 @@ def test_nothing_behind_a_link_is_looked_at(tmp_path: Path) -> None:
     assert (absent.files, absent.unreadable) == ((), True)
 
 
-@each_way
-def test_a_recap_has_a_silence_as_an_event(tmp_path: Path, recalls: bool) -> None:
+def test_a_recap_has_a_silence_as_an_event(remember: Remember) -> None:
     messages = along_x(BEGIN, 300, hz=2)
     messages.append(boolean((T0 + 251) * S, data=True))
     seen = (at for at in range(300) if not 100 <= at < 190)
     messages += [detections((T0 + at) * S + 1, ["cup"] if at < 50 else []) for at in seen]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, clock=SettableClock((T0 + 305) * S), recalls=recalls)
+    memory = remember(messages, split_s=10, clock=SettableClock((T0 + 305) * S))
     reply = asked(memory, "recap", start=T0, end=T0 + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
     assert event["text"] == "/vision/scene/scene_objects was silent"

@@ -26,7 +26,7 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import Remember, asked, memory_of, noted
 from tests.unit.things.test_find import (
     BEGIN,
     HERE,
@@ -134,7 +134,7 @@ def test_things_that_all_went_the_same_way_may_stand_on_a_map_that_shifted(tmp_p
 
     def notes(name: str, was: Sequence[Seen], now: Sequence[Seen]) -> list[str]:
         reply = compared(tmp_path / name, [*looked(0, 30, HERE, *was), *looked(60, 90, HERE, *now)])
-        return [note for note in reply.get("notes", ()) if "shifted" in note]
+        return noted(reply, "shifted")
 
     [note] = notes("all", stood, shifted)
     assert note.startswith("4 of the 4 things in moved went the same way, x +0.30 m and y +0.0")
@@ -235,7 +235,7 @@ def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says
 ) -> None:
     messages = [*looked(0, 60, HERE, MUG), *looked(60, 90, HERE, MUG, BOOK)]
     within = {"start": BEGIN + 20, "end": BEGIN + 50, "with_start": BEGIN, "with_end": BEGIN + 89}
-    [note] = [each for each in compared(tmp_path, messages, **within)["notes"] if "things" in each]
+    [note] = noted(compared(tmp_path, messages, **within), "things")
     assert note.startswith(f"things are not compared after {BEGIN + 50}")
     until_its_end = ask(tmp_path, "compare", **{**within, "end": BEGIN + 89})
     assert labels(until_its_end) == {"appeared": ["book"]}
@@ -352,7 +352,7 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
         assert ("moved" in thing) == (not is_poor)
         assert (thing["place"]["y"] in {0.5, -1.0}) == is_poor
         assert (thing["last_seen"], thing["count"]) == (BEGIN + stop - 0.5, stop - 60)
-    poor = [note for note in reply.get("notes", []) if "localisation was poor" in note]
+    poor = noted(reply, "localisation was poor")
     assert [note.endswith(": book, mug") for note in poor] == [True] * is_poor
     windows = {"with_start": BEGIN, "with_end": BEGIN + 30}
     reply = ask(tmp_path, "compare", start=BEGIN + 90, end=BEGIN + stop, **windows)
@@ -391,11 +391,10 @@ def test_a_small_turn_of_the_map_far_from_the_origin_of_odometry_is_no_jump(
     assert ("localisation was poor" in str(reply.get("notes"))) == is_poor
 
 
-@each_way
 @pytest.mark.parametrize("cut_s", [60.0, 89.75])
 @pytest.mark.parametrize("sigmas_m", [(0.1, 1.0), (1.0, 0.1)])
 def test_the_covariance_that_a_localiser_gave_last_counts_wherever_its_bags_are_cut(
-    tmp_path: Path, sigmas_m: tuple[float, float], cut_s: float, recalls: bool
+    tmp_path: Path, remember: Remember, sigmas_m: tuple[float, float], cut_s: float
 ) -> None:
     """A localiser says nothing while the robot stands: its last message holds until the next."""
     given = [amcl(at, sigma_m) for at, sigma_m in zip((89.6, 89.9), sigmas_m, strict=True)]
@@ -404,5 +403,5 @@ def test_the_covariance_that_a_localiser_gave_last_counts_wherever_its_bags_are_
     before = [message for message in messages if message.log_time < cut]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", before)
     write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[len(before) :])
-    reply = asked(memory_of(tmp_path, limits=NAMED, recalls=recalls), "find_things")
+    reply = asked(remember(limits=NAMED), "find_things")
     assert ["moved" in thing for thing in reply["things"]] == [sigmas_m[-1] < 1.0] * 2

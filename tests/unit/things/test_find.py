@@ -13,7 +13,7 @@ from pathlib import Path
 from random import Random
 from types import SimpleNamespace
 from typing import Any, TypeVar
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 
@@ -50,7 +50,16 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.clocks import in_zone
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import (
+    Remember,
+    asked,
+    clause,
+    each_way,
+    memory_of,
+    noted,
+    remembered,
+    with_store,
+)
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -130,7 +139,7 @@ def test_a_question_for_many_labels_looks_through_all_spots_as_often_as_one_for_
     for asked_for in (labels[:2], labels):
         looks.reset_mock()
         found = ask(tmp_path, label=asked_for, start=BEGIN + 60)
-        missed = [note for note in found["notes"] if "and not once in this window" in note]
+        missed = noted(found, "and not once in this window")
         assert len(missed) == len(asked_for)
         assert looks.call_count == 2 * 2  # what has a place, and what has none
 
@@ -239,7 +248,7 @@ def test_things_that_are_nearer_to_each_other_than_noise_throws_detections_are_t
         messages += scene(at, HERE, seen)
     found = told_of(tmp_path, messages, label="cup")
     assert found["total"] >= 2
-    told = [note for note in found.get("notes", ()) if "they may be one thing" in note]
+    told = noted(found, "they may be one thing")
     assert bool(told) == is_told
     if told:
         assert re.match(r"cup: two of these are only [01]\.\d\d m apart", told[0])
@@ -474,8 +483,7 @@ def test_tracked_objects_are_things_of_their_likeliest_class_by_its_name(
         car, walker = ({1: 0.75, 2: 0.25}, 4.0, 1.0), ({0: 0.25, 7: 0.5}, 3.0, -1.0)
         seen = [car, ({9: 0.5}, 2.0, 2.0), *([walker] if 5 <= second < 15 else [])]
         messages.append(tracked((BEGIN + second) * S, seen))
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, messages, split_s=10)
     memory = with_store(memory, tmp_path) if recalls else memory
     found = asked(memory, "find_things")
     assert found["labels"] == {"pedestrian": 1, "car": 1, "9": 1}
@@ -494,7 +502,7 @@ def test_tracked_objects_are_things_of_their_likeliest_class_by_its_name(
         ("contains_word", "pedestrian"),
         ("equals", "Pedestrian"),
     ):
-        told = {"topic": "/perception/objects", "condition_type": condition_type, "value": value}
+        told = clause("/perception/objects", condition_type, value)
         [seen_row] = asked(memory, "find_matches", **told)["sightings"]
         times = (seen_row["first_seen"] - BEGIN, seen_row["last_seen"] - BEGIN)
         assert (times, seen_row["matched"]) == ((5, 14), ["PEDESTRIAN"])
@@ -572,7 +580,7 @@ def test_a_person_last_seen_in_one_of_many_messages_may_be_a_false_detection(
     ]
     reply = told_of(tmp_path, [*there, *later], label="person")
     assert reply["things"][0]["last_seen"] == BEGIN + 3632
-    notes = [note for note in reply.get("notes", []) if "false detection" in note]
+    notes = noted(reply, "false detection")
     assert [note.rpartition(" ")[2] for note in notes] == [f"{BEGIN + 99}.000000"] * is_lone
     assert all("person was last seen in 1 of 30 messages" in note for note in notes)
 
@@ -639,17 +647,15 @@ def test_what_a_detector_with_other_words_may_call_a_thing_is_said(
     assert told not in str(ask(tmp_path, apart, label=words[0]))
 
 
-@each_way
 def test_what_a_user_asks_for_and_a_detector_is_to_look_for_was_not_seen(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """A command has its object in a text of JSON, beside what is to be done with it."""
     key_value = "diagnostic_msgs/msg/KeyValue"
     command = make(key_value, key="find_object", value='{"object": "glasses"}')
     asked_for = Msg("/command", key_value, (BEGIN + 5) * S, command)
     prompts = text((BEGIN + 5) * S, '{"classes": ["cup", "bottle"]}', topic="/prompts")
-    write_splits(tmp_path, [*looked(0, 20, HERE, MUG), asked_for, prompts])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember([*looked(0, 20, HERE, MUG), asked_for, prompts], split_s=10)
     found = str(asked(memory, "find_things"))
     told = str(asked(memory, "recap", start=BEGIN, end=BEGIN + 20))
     for label in ("glasses", "bottle"):
@@ -735,7 +741,7 @@ def test_which_of_several_alike_moved_is_a_guess(
     compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows)
     assert len(compared["things"]["moved"]) == 1
     for reply in (found, compared):
-        guesses = [note for note in reply.get("notes", ()) if GUESS in note]
+        guesses = noted(reply, GUESS)
         assert guesses == ([GUESS + guess] if guess else [])
 
 
@@ -856,8 +862,10 @@ def test_of_a_marker_without_a_place_it_is_said_that_transforms_may_have_it(
 def test_transforms_of_a_sighting_are_decoded_once_for_the_robot_and_the_thing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.0)))
-    memory, decoded = memory_of(tmp_path), list[tuple[str, bytes]]()
+    memory, decoded = (
+        remembered(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.0)), split_s=10),
+        list[tuple[str, bytes]](),
+    )
 
     def decode(record: Record) -> object:
         decoded.append((record.channel.topic, record.payload))
@@ -865,7 +873,7 @@ def test_transforms_of_a_sighting_are_decoded_once_for_the_robot_and_the_thing(
 
     reader = memory.reader
     monkeypatch.setattr(reader, "decode", decode)
-    cup = {"topic": "/vision/scene/scene_objects", "condition_type": "contains", "value": "cup"}
+    cup = clause("/vision/scene/scene_objects", "contains", "cup")
     [row] = asked(memory, "find_matches", **cup)["sightings"]
     assert (row["robot"]["x"], row["place"]["x"]) == pytest.approx((1.0, 3.0), abs=0.05)
     transforms = [payload for topic, payload in decoded if topic == "/tf"]
@@ -942,7 +950,7 @@ def test_in_the_dark_nothing_is_missed(tmp_path: Path, later: list[Seen]) -> Non
     assert found.keys() == {"crate", "cup", "kettle", "pot", "tray"}
     assert not any("moved_times" in thing for thing in found.values())
     assert not any("not_seen_where_expected" in thing["still_there"] for thing in found.values())
-    [blind] = [note for note in reply["notes"] if "was blind" in note]
+    [blind] = noted(reply, "was blind")
     assert blind.startswith(f"/vision/scene/scene_objects was blind from {BEGIN + 70}")
     windows = {"with_start": BEGIN, "with_end": BEGIN + 59, "start": BEGIN + 70, "end": BEGIN + 600}
     compared = asked(memory_of(tmp_path, limits=NAMED), "compare", **windows)
@@ -1046,7 +1054,7 @@ def test_a_detector_that_repeats_one_message_looks_at_nothing(
         hung += [*robot, replace(message, body=frozen.body)]
     reply = told_of(tmp_path, [*seen, *hung])
     things = reply["things"]
-    [hangs] = [note for note in reply["notes"] if "seems to hang" in note]
+    [hangs] = noted(reply, "seems to hang")
     assert hangs.startswith(f"/vision/scene/scene_objects repeats its message of {BEGIN + 90}.")
     assert hangs in str(asked(memory_of(tmp_path), "memory_status"))
     assert {each["label"]: each["still_there"] for each in things} == {
@@ -1062,34 +1070,32 @@ def drive(begin: int, x: float, seen_from: Callable[[float], Sequence[Seen]]) ->
     return [m for at, x in xs for m in scene(begin + at, (x, 0.0, 0.0), seen_from(x))]
 
 
-def test_where_the_robot_passed_with_what_it_carries_is_no_place_of_it(tmp_path: Path) -> None:
+def test_where_the_robot_passed_with_what_it_carries_is_no_place_of_it(remember: Remember) -> None:
     """It picks a cup up at x = 2, holds it 0.6 m ahead, and puts it down at x = 12.1."""
     before, after = ("cup", 2.0, 0.1), ("cup", 12.1, 0.1)
     carries = drive(30, 1.0, lambda x: [("cup", x + 0.6, 0.05)])
     messages = [*looked(0, 30, HERE, before), *carries, *looked(51, 80, (11.0, 0.0, 0.0), after)]
-    write_splits(tmp_path, messages)
-    plain = memory_of(tmp_path, limits=NAMED)
-    for memory in (plain, with_store(plain, tmp_path)):
-        find = partial(asked, memory, "find_things", label="cup")
-        [cup] = find()["things"]
-        assert (cup["place"]["x"], cup["place"]["y"]) == pytest.approx((12.1, 0.1), abs=0.02)
-        assert [stay["place"]["x"] for stay in cup["moved"]] == pytest.approx([2.0, 12.1], abs=0.02)
-        carrying = find(end=BEGIN + 45)
-        [held] = carrying["things"]
-        assert (held["place"]["x"], held["last_seen"]) == (2.0, BEGIN + 29)
-        goes_along = f"last at {BEGIN + 45}.000000, to go along with the robot"
-        assert goes_along in str(carrying["notes"])
-        assert "go along" not in str(find().get("notes"))
-        window = {
-            "start": BEGIN + 51,
-            "end": BEGIN + 80,
-            "with_start": BEGIN,
-            "with_end": BEGIN + 29,
-        }
-        changed = asked(memory, "compare", **window)["things"]
-        [moved] = changed.pop("moved")
-        assert (moved["was"]["x"], moved["is"]["x"]) == pytest.approx((2.0, 12.1), abs=0.05)
-        assert changed == {}
+    memory = remember(messages, split_s=10, limits=NAMED)
+    find = partial(asked, memory, "find_things", label="cup")
+    [cup] = find()["things"]
+    assert (cup["place"]["x"], cup["place"]["y"]) == pytest.approx((12.1, 0.1), abs=0.02)
+    assert [stay["place"]["x"] for stay in cup["moved"]] == pytest.approx([2.0, 12.1], abs=0.02)
+    carrying = find(end=BEGIN + 45)
+    [held] = carrying["things"]
+    assert (held["place"]["x"], held["last_seen"]) == (2.0, BEGIN + 29)
+    goes_along = f"last at {BEGIN + 45}.000000, to go along with the robot"
+    assert goes_along in str(carrying["notes"])
+    assert "go along" not in str(find().get("notes"))
+    window = {
+        "start": BEGIN + 51,
+        "end": BEGIN + 80,
+        "with_start": BEGIN,
+        "with_end": BEGIN + 29,
+    }
+    changed = asked(memory, "compare", **window)["things"]
+    [moved] = changed.pop("moved")
+    assert (moved["was"]["x"], moved["is"]["x"]) == pytest.approx((2.0, 12.1), abs=0.05)
+    assert changed == {}
 
 
 @pytest.mark.parametrize("in_sight_m", [3.0, 5.0])
@@ -1295,10 +1301,8 @@ def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     assert compared == [2, 4, 8, 8]
 
 
-def test_of_a_window_before_what_was_compared_no_never_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
+@patch.object(known, "_MOST_SPOTS", 3)
+def test_of_a_window_before_what_was_compared_no_never_is_said(tmp_path: Path) -> None:
     crowded, start_s = eight_bags(tmp_path), float(begin_of(0))
     for labels, seen in (((), THINGS[2:5]), (("thing 0",), ()), (("thing 7",), ())):
         found = find_things(
