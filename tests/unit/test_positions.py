@@ -33,7 +33,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, clause, memory_of, remembered
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -82,10 +82,7 @@ def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
     assert "carries no position" in refused["detail"]
 
 
-@each_way
-def test_latitude_and_longitude_of_a_receiver_of_px4_are_its_position(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_latitude_and_longitude_of_a_receiver_of_px4_are_its_position(remember: Remember) -> None:
     type_name, degrees = "px4_msgs/msg/SensorGps", {"latitude_deg": 48.1, "longitude_deg": 11.7}
     messages = [
         Msg(
@@ -96,7 +93,7 @@ def test_latitude_and_longitude_of_a_receiver_of_px4_are_its_position(
         )
         for n, fix_type in enumerate([3, 1, 6])
     ]
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     for n, has_fix in enumerate([True, False, True]):
         found = asked(memory, "get_position_at", timestamp=T0_S + n, topic="/gps")
         assert (found["latitude"], found["longitude"]) == (48.1, 11.7)
@@ -127,13 +124,10 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map_and_its_numbers_are_t
     assert not any("no fix" in note for note in before.get("notes", ()))
 
 
-@each_way
-def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(remember: Remember) -> None:
     """As in the fields that are shown."""
     poses = [vehicle(T0 + n * S, n) for n in range(9)]
-    of_vehicle = partial(asked, remembered(tmp_path, poses, recalls=recalls), topic=VEHICLE)
+    of_vehicle = partial(asked, remember(poses), topic=VEHICLE)
     for field, value, last in (
         ("velocity.0", 0.5, 8),
         ("position.0", 5, 5),
@@ -148,7 +142,7 @@ def test_an_element_of_an_array_that_is_shown_as_a_point_is_its_axis(
 
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [vehicle(T0 + n * S, n) for n in range(9)])
-    above = {"topic": "/*odometry", "condition_type": "above", "value": 1.0, "field": "position.z"}
+    above = clause("/*odometry", "above", 1.0, field="position.z")
     note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 1}),
@@ -162,8 +156,7 @@ def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     assert asked(memory, "find_matches", **above)["notes"].count(note) == 1
 
 
-@each_way
-def test_the_local_position_of_px4_is_in_north_east_down(tmp_path: Path, recalls: bool) -> None:
+def test_the_local_position_of_px4_is_in_north_east_down(remember: Remember) -> None:
     """Its messages name no frame: by its definition it is that one."""
     type_name = "px4_msgs/msg/VehicleLocalPosition"
 
@@ -173,7 +166,7 @@ def test_the_local_position_of_px4_is_in_north_east_down(tmp_path: Path, recalls
             "/flown", type_name, T0 + n * S, make(type_name, timestamp=n, xy_valid=True, **numbers)
         )
 
-    memory = remembered(tmp_path, [flown(n) for n in range(20)], recalls=recalls)
+    memory = remember([flown(n) for n in range(20)])
     note = "in NED x is north, y east and z down: yaw is clockwise from north, seen from above"
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 4, "topic": "/flown"}),
@@ -230,7 +223,6 @@ def test_the_only_odometry_in_a_namespace_places_the_robot_also_beside_its_local
         )
 
 
-@each_way
 @pytest.mark.parametrize(
     ("tool", "given"),
     [
@@ -241,9 +233,9 @@ def test_the_only_odometry_in_a_namespace_places_the_robot_also_beside_its_local
     ],
 )
 def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
-    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+    remember: Remember, tool: str, given: dict[str, Any]
 ) -> None:
-    reply = asked(remembered(tmp_path, FIXES[:9], recalls=recalls), tool, **given)
+    reply = asked(remember(FIXES[:9]), tool, **given)
     detail = reply["notes"][0] if tool == "recap" else reply["detail"]
     assert "data.pose_topic=/fix" not in detail
     assert "give topic" not in detail
@@ -252,13 +244,12 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     assert "data.pose_topic is /odom" in detail
 
 
-@each_way
-def test_a_pose_in_degrees_has_its_heading(tmp_path: Path, recalls: bool) -> None:
+def test_a_pose_in_degrees_has_its_heading(remember: Remember) -> None:
     of = "geographic_msgs/msg/Geo"
     at = make(f"{of}Point", latitude=38.7, longitude=-9.1, altitude=40.0)
     pose = make(f"{of}Pose", position=at, orientation=quaternion(math.radians(30)))
     body = make(f"{of}PoseStamped", header=header(T0, "earth"), pose=pose)
-    memory = remembered(tmp_path, [Msg("/geopose", f"{of}PoseStamped", T0, body)], recalls=recalls)
+    memory = remember([Msg("/geopose", f"{of}PoseStamped", T0, body)])
     found = asked(memory, "get_position_at", timestamp=T0_S, topic="/geopose")
     assert (found["latitude"], found["x"], found["yaw_deg"]) == (38.7, None, pytest.approx(30))
 
@@ -275,13 +266,12 @@ def moved(tenths: range) -> list[Msg]:
     ]
 
 
-@each_way
-def test_in_a_gap_of_transforms_no_position_is_known(tmp_path: Path, recalls: bool) -> None:
+def test_in_a_gap_of_transforms_no_position_is_known(remember: Remember) -> None:
     messages = [*moved(range(100)), *moved(range(400, 600)), *FIXES]
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     for given in ({}, {"frame_id": "odom"}, {"topic": "/tf"}):
         reply = asked(memory, "get_position_at", timestamp=T0_S + 25, **given)
-        assert (reply["error"], reply["reason"]) == ("no_data", "gap")
+        assert reply["reason"] == "gap"
         assert "no message of /tf within 10 s" in reply["detail"]
         assert "latitude and longitude are on /fix" in reply["detail"]
     reply = asked(memory, "get_position_at", timestamp=T0_S + 25, topic="/fix")
@@ -471,8 +461,7 @@ def test_a_frame_that_the_map_corrects_is_not_the_body(tmp_path: Path, body: str
     assert (reply["x"], reply["notes"]) == (6.0, [f"by transforms, of {body}"])
 
 
-@each_way
-def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool) -> None:
+def test_other_transforms_are_no_pose_of_the_robot(remember: Remember) -> None:
     """Its localiser goes on ten times a second, its odometry once, and not from 20 to 40 s."""
     messages: list[Msg] = []
     for tenth in range(600):
@@ -480,7 +469,7 @@ def test_other_transforms_are_no_pose_of_the_robot(tmp_path: Path, recalls: bool
         messages.append(tf_of(at, "map", "odom", (1.0, 0.0, 0.0)))
         if tenth % 10 == 0 and not 200 < tenth < 400:
             messages.append(tf(at + 1, transform(at, "odom", "base_link", (tenth / 10, 0.0, 0.0))))
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     refused = asked(memory, "get_position_at", timestamp=T0_S + 10.5)
     assert refused["reason"] == "between_messages"
     assert "no transform of base_link in map within 0.1 s" in refused["detail"]
@@ -532,14 +521,13 @@ def slam_pose(ns: int, x: float, turn: object) -> Msg:
 NO_TURN = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
 
 
-@each_way
-def test_a_null_pose_of_lost_tracking_is_no_position(tmp_path: Path, recalls: bool) -> None:
+def test_a_null_pose_of_lost_tracking_is_no_position(remember: Remember) -> None:
     def told(n: int) -> Msg:
         is_lost = 20 <= n < 40
         place, turn = (0.0, NO_TURN) if is_lost else (5.0 + 0.1 * n, quaternion(0.0))
         return slam_pose(T0 + n * S, place, turn)
 
-    memory = remembered(tmp_path, [*map(told, range(60))], recalls=recalls)
+    memory = remember([*map(told, range(60))])
     reply = asked(memory, "get_position_at", timestamp=T0_S + 30)
     assert (reply["x"], reply["y"], reply["yaw_deg"]) == (None, None, None)
     assert "all zeros, as where tracking is lost" in str(reply["notes"])
@@ -548,10 +536,9 @@ def test_a_null_pose_of_lost_tracking_is_no_position(tmp_path: Path, recalls: bo
     assert (path["poses"], path["gap_m"]) == (40, pytest.approx(2.1))
 
 
-@each_way
-def test_a_position_without_a_rotation_is_one(tmp_path: Path, recalls: bool) -> None:
+def test_a_position_without_a_rotation_is_one(remember: Remember) -> None:
     beacon = [slam_pose(T0 + n * S, 0.1 * n, NO_TURN) for n in range(1, 9)]
-    memory = remembered(tmp_path, [odom(T0, 0.0), *beacon], recalls=recalls)
+    memory = remember([odom(T0, 0.0), *beacon])
     assert asked(memory, "get_position_at", timestamp=T0_S)["x"] == 0.0
     reply = asked(memory, "get_position_at", timestamp=T0_S + 5, topic="/slam/pose")
     assert (reply["x"], reply["yaw_deg"]) == (0.5, None)
@@ -591,7 +578,7 @@ def test_what_happened_is_in_places_of_several_frames_the_smallest_first(tmp_pat
     there = asked(memory, "get_position_at", timestamp=T0_S + 1)
     events = asked(memory, "recap", start=T0_S, end=T0_S + 59)["events"]
     assert len(events) >= 3
-    seen = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
+    seen = clause("/vision/*", "contains", "cup")
     [cup] = asked(memory, "find_matches", **seen)["sightings"]
     for at in (there, *(event for event in events if "in" in event), cup["place"]):
         assert (at["in"], at["also_in"]) == ("dock", ["pen", "yard"])
@@ -611,14 +598,14 @@ def test_a_frame_that_is_known_at_other_times_alone_is_no_data_and_says_when_it_
         ("trajectory_summary", later),
     ):
         answer = asked(memory, tool, frame_id="map", **given)
-        assert (answer["error"], answer["reason"]) == ("no_data", "outside_range")
+        assert answer["reason"] == "outside_range"
         assert answer["detail"].startswith("no transform leads to map from odom then: ")
         assert f"at {T0_S + 19}" in answer["detail"]
         answer = asked(memory, tool, frame_id="moon", **given)
         assert answer["error"] == "invalid_arguments"
     both = asked(memory, "get_position_at", timestamps=[T0_S + 10, T0_S + 50], frame_id="map")
     assert [each.get("x", each.get("error")) for each in both["results"]] == [6.0, "no_data"]
-    said = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+    said = clause("/chatter", "contains", "hello")
     answer = asked(memory, "find_matches", frame_id="map", **said)
     newest, oldest = answer["sightings"]
     assert (newest["robot"], oldest["robot"]["x"]) == (None, 6.0)
@@ -711,8 +698,9 @@ def test_a_pose_that_a_rare_correction_of_the_map_does_not_reach_yet_gives_way_t
         messages += [odom(at, x, 0.0, 0.0), tf(at, body)]
         if nth % 10 == 1:
             messages.append(tf_of(at, "map", "odom", (3.0, 0.0, 0.0), 0.0))
-    write_mcap(tmp_path / "run_0.mcap", messages)
-    ask = partial(asked, memory_of(tmp_path), "get_position_at", topic=topic, frame_id="map")
+    ask = partial(
+        asked, remembered(tmp_path, messages), "get_position_at", topic=topic, frame_id="map"
+    )
     refused = ask(timestamp=T0_S + 4.95, tolerance_s=0.3)
     assert "no transform" in refused["detail"]
     assert "ask with tolerance_s of at least 0.4" in refused["detail"]

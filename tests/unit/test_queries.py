@@ -17,7 +17,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import along_x, command, detections, odom, text
 from tests.support.closed_form import TURN_RATE, position
-from tests.support.memories import ROOT, asked, memory_of, remembered, with_store
+from tests.support.memories import ROOT, Remember, asked, memory_of, remembered
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 T0 = 1_700_000_000 * 10**9
@@ -134,12 +134,11 @@ def test_fields_go_on_into_a_text_of_json(tmp_path: Path) -> None:
     assert asked(memory, "get_topic_at_time", **plain)["error"] == "invalid_arguments"
 
 
-def test_numbers_in_texts_of_json_are_summarised_by_hour(tmp_path: Path) -> None:
+def test_numbers_in_texts_of_json_are_summarised_by_hour(remember: Remember) -> None:
     said = ('{"note": "a"}', *(json.dumps({"kg": kg}) for kg in (2.5, 9, 4)))
-    memory = remembered(tmp_path, [text(T0 + n * S, one, "/task") for n, one in enumerate(said)])
+    stored = remember([text(T0 + n * S, one, "/task") for n, one in enumerate(said)])
     window = {"topic": "/task", "start": T0 // S, "end": T0 // S + 9, "fields": ["data.kg"]}
-    for stored in (memory, with_store(memory, tmp_path)):
-        reply = asked(stored, "get_topic_in_range", by="hour", **window)
-        row = dict(zip(reply["columns"], reply["rows"][0], strict=True))
-        summary = [row[f"data.kg.{what}"] for what in ("first", "last", "min", "max", "mean")]
-        assert summary == [2.5, 4, 2.5, 9, pytest.approx(5.166667)]
+    reply = asked(stored, "get_topic_in_range", by="hour", **window)
+    row = dict(zip(reply["columns"], reply["rows"][0], strict=True))
+    summary = [row[f"data.kg.{what}"] for what in ("first", "last", "min", "max", "mean")]
+    assert summary == [2.5, 4, 2.5, 9, pytest.approx(5.166667)]

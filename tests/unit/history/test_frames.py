@@ -27,7 +27,7 @@ from ros2_memory.queries import frames
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, in_order, odom, tf, tf_of, transform, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import Remember, asked, memory_of, with_store
 
 S = 10**9
 T0 = 1_784_000_000 * S
@@ -165,30 +165,28 @@ def test_after_a_restart_a_transform_is_that_of_the_recording_that_goes_on(
             assert x_of(memory, begin - S // 10) == 1.0
 
 
-@each_way
 def test_recordings_joined_by_a_handover_share_their_transforms(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """A publisher that has gone is not heard by the recording that took over."""
     first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T010000Z"
     record(first, [fixed(T0, "map", "odom", 7.0), *drive(T0, 20)])
     record(second, [fixed(T0 + 21 * S, "base_link", "laser", 1.0), *drive(T0 + 21 * S, 20)])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert x_of(memory, T0 + 33 * S) == "frame_unknown"
     write_handover(first, Handover(next=second.name))
     write_handover(second, Handover(previous=first.name))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert x_of(memory, T0 + 33 * S) == 7.0
     assert arrivals(memory, 12.0) == [pytest.approx(30.6, abs=0.3), pytest.approx(9.6, abs=0.3)]
 
 
-@each_way
-def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls: bool) -> None:
+def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, remember: Remember) -> None:
     """One records what moves, one what is static, one neither."""
     record(tmp_path / "fixed", [fixed(T0, "map", "odom", 7.0)])
     record(tmp_path / "moving", moving(T0, 20, "odom", "base_link", 0.0, 0.5))
     record(tmp_path / "sensors", drive(T0, 20))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     joined = looked_up(memory, T0 + 4 * S, "map", "base_link")
     assert joined["translation"]["x"] == pytest.approx(9.0)
     assert "fixed and moving are combined" in str(joined["notes"])
@@ -292,16 +290,15 @@ def test_which_frames_there_are_is_stored_though_columns_of_transforms_are_not(
     assert not read
 
 
-@each_way
 def test_of_a_frame_that_is_seen_now_and_then_the_nearest_time_is_named(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """As a marker, whose transform is published while a camera sees it."""
     messages = moving(T0, 600, "odom", "base_link", 0.0, 0.1)
     for begin in (100, 400):
         messages += moving(T0 + begin * S, 20, "odom", "tag", 5.0, 0.0)
     record(tmp_path / "one", in_order(messages))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     for second, away, nearest in ((200, "80 s earlier", 120.0), (350, "50 s later", 400.1)):
         refused = looked_up(memory, T0 + second * S, "base_link", "tag")
         assert refused["reason"] == "gap"
@@ -326,8 +323,7 @@ def test_a_frame_that_two_nodes_place_in_two_parents_is_named(tmp_path: Path) ->
         assert said in refused["detail"]
 
 
-@each_way
-def test_a_frame_without_a_name_or_a_rotation_is_none(tmp_path: Path, recalls: bool) -> None:
+def test_a_frame_without_a_name_or_a_rotation_is_none(tmp_path: Path, remember: Remember) -> None:
     """Nor advised for another time; tf2 refuses a quaternion that nobody filled in, too."""
     unfilled: Any = transform(T0, "base_link", "laser", (1.0, 0.0, 0.0))
     unfilled.transform.rotation.w = 0.0
@@ -335,7 +331,7 @@ def test_a_frame_without_a_name_or_a_rotation_is_none(tmp_path: Path, recalls: b
     nameless = moving(T0, 20, "", "arm", 0.0, 0.0)
     placed = moving(T0, 20, "odom", "base_link", 0.0, 0.0)
     record(tmp_path / "one", [static, *nameless, *placed])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     listed = asked(memory, "list_frames")
     assert listed["frames"] == ["base_link", "odom"]
     assert [note for note in listed["notes"] if "no name" in note and note.endswith("1")]

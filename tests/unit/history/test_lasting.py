@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.bags import along_x, battery, boolean, in_order, write_mcap
 from tests.support.housekeepers import T0, S
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, clause, memory_of
 
 DAY_S = 86_400
 
@@ -66,12 +66,12 @@ def test_each_session_says_for_how_long_its_messages_last(tmp_path: Path, seed: 
     low = {"condition_type": "below", "field": "percentage", "value": 0.5}
     assert held(topic="/battery_state", **low) == [*expected(sessions, is_state=False)]
     flags = [*expected(sessions, is_state=True)]
-    true = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    true = clause("/bumper", "equals", True)
     assert held(**true) == flags
     lengths = sum(last - first for first, last in flags)
     window = {"start": T0 / S, "end": T0 / S + 5 * DAY_S}
     by_value = asked(memory, "get_topic_in_range", topic="/bumper", by="value", **window)
     assert [row[:3] for row in by_value["rows"]] == [["true", len(flags), lengths]]
-    driven_so = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
+    driven_so = clause("/odom", "above", -1, field="position.x")
     parts = asked(memory, "find_matches", **driven_so, **{"while": true}, limit=100)["sightings"]
     assert sum(row["duration_s"] for row in parts) == pytest.approx(lengths, abs=len(parts))

@@ -28,7 +28,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, keeper_of, kept
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import Remember, asked, clause, each_way, memory_of
 
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
 
@@ -80,38 +80,36 @@ def test_a_boot_with_a_wrong_clock_makes_no_topic_of_its_session_rare(tmp_path: 
     assert [row[:3] for row in reply["rows"]] == [["true", 2, 59.8], ["false", 2, 0.0]]
 
 
-@each_way
 def test_a_flag_that_came_every_twenty_seconds_holds_until_it_fell_silent(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """It was true for hours in which data_time_range has its silence, and while knew nothing."""
     ticks = [boolean(T0 + at * S, True) for at in range(0, 600, 20)]
     write_splits(tmp_path, [*ticks, *drive(T0, T0 + 5400 * S)[::10]], 1800)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     window = {"start": T0 / S, "end": T0 / S + 5390}
-    true = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    true = clause("/bumper", "equals", True)
     ask = partial(asked, memory, "find_matches", **window)
     held = asked(memory, "get_topic_in_range", topic="/bumper", by="value", **window)
     assert [row[:3] for row in held["rows"]] == [["true", 1, 580.0]]
     by_hour = ask(**true, by="hour")
     assert by_hour["all"][by_hour["columns"].index("seconds") - 1] == 580
     assert [row["duration_s"] for row in ask(**true)["sightings"]] == [580]
-    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    driven = clause("/odom", "above", -1, field="position.x")
     [driven_so] = ask(**driven, **{"while": true})["sightings"]
     assert driven_so["duration_s"] == 580
 
 
-@each_way
 def test_a_flag_that_holds_since_before_a_window_is_noted_as_a_latched_value_is(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """A door that stood open all the time was never open by find_matches, though by hour it was."""
     door = [boolean(T0 + at * S, at != 1500, "/door") for at in (100, 1500)]
     write_mcap(tmp_path / "r" / "r_0.mcap", in_order([*door, *drive(T0, T0 + 1800 * S)[::10]]))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
 
     def found(wanted: bool, begin: int) -> Any:
-        asks = {"topic": "/door", "condition_type": "equals", "value": wanted}
+        asks = clause("/door", "equals", wanted)
         window = {"start": T0 / S + begin, "end": T0 / S + begin + 200}
         return asked(memory, "find_matches", **asks, **window)
 
@@ -139,7 +137,7 @@ def test_the_pace_of_a_topic_is_measured_in_all_recordings_at_once(
         for number in range(many):
             bumps = [boolean(T0 + (600 * number + at) * S, at == 60) for at in (0, 60, 120)]
             write_mcap(tmp_path / f"{many}" / f"r{number}" / "r_0.mcap", bumps)
-        bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
+        bumped = clause("/bumper", "equals", True)
         measured.clear()
         window = {"start": T0 / S, "end": T0 / S + 600 * many}
         reply = asked(memory_of(tmp_path / f"{many}"), "find_matches", **bumped, **window)
@@ -148,9 +146,8 @@ def test_the_pace_of_a_topic_is_measured_in_all_recordings_at_once(
     assert found[0] == found[1]
 
 
-@each_way
 def test_how_long_what_a_topic_says_holds_is_of_its_own_session(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """A bumper whose driver once repeated its state: values of all later days held for 0 s, until
     that day was deleted."""
@@ -164,8 +161,8 @@ def test_how_long_what_a_topic_says_holds_is_of_its_own_session(
     for number, (period_s, hits) in enumerate([(0.1, [4, 5]), (60, [2, 3, 7])]):
         write_mcap(tmp_path / f"r{number}" / "r_0.mcap", bumps(number, period_s, hits))
     start = T0 / S + day
-    bumped = {"topic": "/bumper", "condition_type": "equals", "value": True}
-    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    bumped = clause("/bumper", "equals", True)
+    driven = clause("/odom", "above", -1, field="position.x")
     asks: list[tuple[str, dict[str, object]]] = [
         ("get_topic_in_range", {"topic": "/bumper", "changes": True}),
         ("get_topic_in_range", {"topic": "/bumper", "by": "value"}),
@@ -175,7 +172,7 @@ def test_how_long_what_a_topic_says_holds_is_of_its_own_session(
     ]
 
     def replies() -> list[Any]:
-        memory = memory_of(tmp_path, recalls=recalls)
+        memory = remember()
         return [asked(memory, name, **given, start=start, end=start + 599) for name, given in asks]
 
     changes, *rest = replies()
@@ -354,8 +351,8 @@ def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
         "deleted",
         False,
     ]
-    odometry = {"topic": "/odom", "condition_type": "above", "value": 0, "field": "position.x"}
-    docked_then = {"topic": DOCKED, "condition_type": "equals", "value": True}
+    odometry = clause("/odom", "above", 0, field="position.x")
+    docked_then = clause(DOCKED, "equals", True)
     for end, last in ((12, 12), (50, 20)):
         span = {"start": T0_S, "end": T0_S + end, "while": docked_then}
         answer = asked(asking, "find_matches", **odometry, **span)
@@ -364,9 +361,8 @@ def test_a_value_is_not_held_on_across_messages_that_were_deleted_by_request(
     assert answer["unknown_s"] == 30
 
 
-@each_way
 def test_a_refusal_says_how_to_ask_what_a_rare_text_said_last(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """A mission manager says what it does when that changes, minutes before."""
     said = {0: "CHARGING", 400: "SCOUTING", 1000: "CHARGING"}
@@ -374,7 +370,7 @@ def test_a_refusal_says_how_to_ask_what_a_rare_text_said_last(
         states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said.items()]
         moving = [odom(T0 + (begin + at) * S, at) for at in range(1200)]
         write_mcap(tmp_path / f"run{begin}" / "run_0.mcap", in_order([*states, *moving]))
-    asking = memory_of(tmp_path, recalls=recalls)
+    asking = remember()
 
     refused = at(asking, "/mission", T0 + 900 * S)
     advice = "to accept the older one, ask with tolerance_s of at least 500.000"
@@ -395,7 +391,7 @@ def test_refusals_of_any_text_and_of_a_message_without_one_value_say_what_to_ask
     memory = memory_of(tmp_path)
     span = {"start": T0 / S, "end": T0 / S + 2}
 
-    blank = {"topic": "/chatter", "condition_type": "contains", "value": ""}
+    blank = clause("/chatter", "contains", "")
     for by in ({}, {"by": "value"}):
         refused = asked(memory, "find_matches", **blank, **by)["detail"]
         assert "not blank; for example" in refused

@@ -42,7 +42,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import Remember, asked, clause, memory_of, remembered, with_store
 from tests.support.noting_reader import NotingReader
 
 T0_S = 1_700_000_000
@@ -140,17 +140,16 @@ def test_a_constant_may_be_of_the_first_or_of_the_last_definition_of_a_type(
         last(memory, "equals", "FIX_GONE", "/fix", field="fix")
 
 
-@each_way
-def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recalls: bool) -> None:
+def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, remember: Remember) -> None:
     level = make("std_msgs/msg/Float32", data=45.5)
     before = [Msg("/level", "std_msgs/msg/Float32", T0, level), text(T0, "45", topic="/said")]
     later = replace(battery(T0 + 10 * NS_PER_S, 0.5), topic="/level")
     write_mcap(tmp_path / "rec" / "rec_0.mcap", before)
     write_mcap(tmp_path / "rec" / "rec_1.mcap", [later])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
 
     def reply(tool: str, field: str, limit: float, topic: str = "/level") -> Any:
-        given = {"topic": topic, "condition_type": "above", "field": field, "value": limit}
+        given = clause(topic, "above", limit, field=field)
         return asked(memory, tool, **given)
 
     for field in ("data", "value"):
@@ -165,18 +164,17 @@ def test_a_field_of_either_type_of_a_topic_is_searched(tmp_path: Path, *, recall
     assert "BatteryState the values have no field 'percent'" in refused["detail"]
 
 
-@each_way
 def test_a_battery_that_stated_fractions_before_percent_is_noted(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     days = {"fri": [0.9, 0.7], "sat": [0.6, 0.1], "sun": [83.0, 0.8], "mon": [97.0, 90.0]}
     for nth, (day, charges) in enumerate(days.items()):
         times = (T0 + (1000 * nth + second) * NS_PER_S for second in range(2))
         write_mcap(tmp_path / day / f"{day}_0.mcap", map(battery, times, charges))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
 
     def notes(topic: str) -> list[str]:
-        given = {"topic": topic, "condition_type": "below", "field": "percentage", "value": 20}
+        given = clause(topic, "below", 20, field="percentage")
         reply = asked(memory, "find_matches", **given)
         return [note for note in reply["notes"] if "fraction" in note]
 
@@ -220,7 +218,7 @@ def statistics(second: int, *data: float) -> Msg:
 
 def test_a_refusal_names_the_fields_of_what_a_list_has_that_is_empty_now(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [statistics(second) for second in range(9)])
-    given = {"topic": "/statistics", "condition_type": "above", "value": 0}
+    given = clause("/statistics", "above", 0)
     for field in ("data", "statistics.size"):
         refused = asked(memory, "find_matches", field=field, **given)
         assert refused["detail"].endswith(
@@ -239,7 +237,7 @@ def test_a_detector_that_sees_nothing_for_long_has_the_fields_of_a_detection(
     """Also of a type in the schema map."""
     seen = [detections(T0 + second * NS_PER_S, []) for second in range(9)]
     memory = remembered(tmp_path, seen)
-    given = {"topic": SCENE, "condition_type": "above", "field": "confidence", "value": 0.5}
+    given = clause(SCENE, "above", 0.5, field="confidence")
     refused = asked(memory, "find_matches", **given)["detail"]
     assert refused.endswith(
         "their fields are: skill, detections, detections.label, detections.score, "
@@ -363,7 +361,7 @@ def test_a_constant_stands_for_the_number_that_each_type_of_a_topic_gives_it(
 
 def test_a_field_that_replies_do_not_show_is_refused_with_what_shows_it(tmp_path: Path) -> None:
     memory = remembered(tmp_path, [odom(T0, 1.0)])
-    limit = {"topic": "/odom", "condition_type": "above", "value": 0.3}
+    limit = clause("/odom", "above", 0.3)
     for tool in ("find_matches", "find_last_match"):
         refused = asked(memory, tool, **limit, field="pose.covariance.0")
         assert refused["detail"] == (
@@ -455,7 +453,7 @@ def test_texts_of_which_it_is_not_known_whether_they_end_are_said_to_be_such(
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
     over = Deadline.after(0, itertools.count().__next__)
     monkeypatch.setattr(Call, "partial_after", lambda *_: over)
-    wash = {"topic": "/chatter", "condition_type": "contains", "value": "wash"}
+    wash = clause("/chatter", "contains", "wash")
     reply = asked(memory_of(tmp_path), "find_matches", **wash)
     assert len(reply["sightings"]) == 4
     assert "may have held for longer" in str(reply["notes"])
@@ -468,7 +466,7 @@ def test_of_recordings_that_overlap_each_message_is_tested_once(tmp_path: Path) 
         said[7] = replace(said[7], body=bytes([nth]))
         write_mcap(tmp_path / name / f"{name}_0.mcap", said)
     memory, matches = memory_of(tmp_path), ReverseSearch.matches
-    never = {"topic": "/chatter", "condition_type": "contains", "value": "nobody"}
+    never = clause("/chatter", "contains", "nobody")
     with patch.object(ReverseSearch, "matches", autospec=True, side_effect=matches) as tested:
         assert asked(memory, "find_matches", **never)["sightings"] == []
     assert tested.call_count == 600

@@ -1,6 +1,5 @@
 """Many bags read as one history, in which each message counts once, and in one order."""
 
-import os
 import random
 import time
 from collections.abc import Iterator, Sequence
@@ -8,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -34,12 +34,13 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
+    set_mtime,
     text,
     write_mcap,
 )
 from tests.support.column_worlds import EVERYTHING
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, reply_over, with_store
+from tests.support.memories import Remember, asked, memory_of, remembered, reply_over, with_store
 from tests.support.noting_reader import NotingReader
 from tests.support.random_histories import S
 
@@ -156,12 +157,11 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         assert last.time == counted[-1][0]
 
 
-@each_way
 def test_a_chunk_that_no_cache_holds_is_decompressed_once_for_all_messages_that_are_picked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+    remember: Remember, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_mcap(tmp_path / "bag.mcap", [text(nth * S, f"{nth}") for nth in range(1, 201)])
-    memory = memory_of(tmp_path, reader=McapReader(cache_mb=0), recalls=recalls)
+    messages = [text(nth * S, f"{nth}") for nth in range(1, 201)]
+    memory = remember(messages, reader=McapReader(cache_mb=0))
     view = View(memory, Call())
     total, chosen = pick(view, "/chatter", EVERYTHING, 100)
     decompressed: list[int] = []
@@ -174,9 +174,8 @@ def test_a_chunk_that_no_cache_holds_is_decompressed_once_for_all_messages_that_
     assert (total, len([*chosen]), len(decompressed)) == (200, 100, 1)
 
 
-@each_way
 def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_way(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """The third one is 2.1 s after the first, and 1.9 s after a copy, which counts for nothing."""
     for name, at_s in (("one", 1.9), ("two", 2.1), ("three", 4.0)):
@@ -184,7 +183,7 @@ def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_w
         received = replace(moved, log_time=T0 + round(at_s * S), publish_time=T0 + S)
         around = [text(T0 - 5 * S, f"{name} begins"), text(T0 + 20 * S, f"{name} ends")]
         write_mcap(tmp_path / name / f"{name}_0.mcap", [around[0], received, around[1]])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     window = {"topic": "/chatter", "start": T0 / S + 1, "end": T0 / S + 5}
     shown = asked(memory, "get_topic_in_range", **window)["samples"]
     assert [sample["timestamp"] for sample in shown] == [T0 / S + 1.9, T0 / S + 4]
@@ -192,9 +191,8 @@ def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_w
     assert reply["timestamp"] == T0 / S + 4
 
 
-@each_way
 def test_of_a_message_that_two_recordings_have_twice_each_one_copy_is_of_the_second(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """The last one is 2.25 s after the first, whose copy was met, and 0.75 s after the second."""
     for name, received_s in (("one", (0.0, 1.5)), ("two", (0.125, 2.25))):
@@ -204,7 +202,7 @@ def test_of_a_message_that_two_recordings_have_twice_each_one_copy_is_of_the_sec
         ]
         begin, end = text(T0 - S, f"{name} begins"), text(T0 + 5 * S, f"{name} ends")
         write_mcap(tmp_path / name / f"{name}_0.mcap", [begin, *received, end])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     window = {"topic": "/chatter", "start": T0 / S, "end": T0 / S + 4}
     shown = asked(memory, "get_topic_in_range", **window)["samples"]
     assert [sample["timestamp"] for sample in shown] == [T0 / S, T0 / S + 1.5]
@@ -224,20 +222,19 @@ def test_a_bag_that_changes_after_it_was_looked_up_is_not_taken_from_memory(
     shorter, deleted = View(memory, Call()), View(memory, Call())
     changed = path.stat().st_mtime_ns + S
     write_mcap(path, [boolean(T0, True)])
-    os.utime(path, ns=(changed, changed))
+    set_mtime(path, changed)
     assert scanned(shorter) == [T0]
     path.unlink()
     assert scanned(deleted) == []
     assert "a/a_0.mcap was deleted before it could be read" in deleted.notes.sentences()[0]
 
 
-@each_way
+@patch.object(decode, "GROUP_BYTES", 260_000)
+@patch.object(bulk, "BATCH_BYTES", 20_000)
 def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """A recorder of simulated time gives five messages each second of it."""
-    monkeypatch.setattr(decode, "GROUP_BYTES", 260_000)
-    monkeypatch.setattr(bulk, "BATCH_BYTES", 20_000)
     layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
     kind = "std_msgs/msg/Float32MultiArray"
     messages = [
@@ -247,7 +244,7 @@ def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
     ]
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=20_000))
     assert len([*decode.undecoded(McapReader(), path)]) > 2
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     wanted = {"topic": "/numbers", "condition_type": "equals", "field": "data.700"}
     for nth in range(0, 50, 6):
         found = asked(memory, "find_matches", **wanted, value=4_000 * nth + 700)
@@ -265,8 +262,7 @@ def test_the_time_after_the_last_message_of_a_bag_is_time_of_reading(
             yield from super().records(*args, **given)
             now[0] += S
 
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(T0)])
-    view = View(memory_of(tmp_path, reader=Slow()), Call())
+    view = View(remembered(tmp_path, [odom(T0)], reader=Slow()), Call())
     monkeypatch.setattr(time, "perf_counter_ns", lambda: now[0])
     assert len([*view.stream.messages(["/odom"], TimeWindow.everything())]) == 1
     assert view.call.stages.spent["read"] == S

@@ -15,7 +15,7 @@ from ros2_memory.core.regions import Circle, Storey
 from ros2_memory.history.context import Memory
 from tests.support.bags import detected, odom, tf_of, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, memory_of, remembered
 from tests.support.storeys import (
     BEGIN,
     END,
@@ -136,18 +136,15 @@ def test_what_was_carried_to_the_storey_above_was_moved(tmp_path: Path) -> None:
     assert (moved["was"]["in"], moved["is"]["in"]) == ("kitchen", "bedroom")
 
 
-@each_way
 @pytest.mark.parametrize(
     "of_body", [False, True], ids=["odometry in the plane", "transforms alone"]
 )
-def test_transforms_to_the_map_have_heights(
-    tmp_path: Path, *, of_body: bool, recalls: bool
-) -> None:
+def test_transforms_to_the_map_have_heights(remember: Remember, *, of_body: bool) -> None:
     messages = []
     for at, (x, z) in zip(TIMES, WAY, strict=True):
         own = tf_of(at, "odom", "base_link", (x, 0.0, 0.0)) if of_body else odom(at, x)
         messages += [tf_of(at, "map", "odom", (0.0, 0.0, z)), own]
-    memory = with_places(remembered(tmp_path, messages, recalls=recalls), frame="map")
+    memory = with_places(remember(messages), frame="map")
     for name in HOUSE:
         [row] = asked(memory, "visits", where=name)["visits"]
         inside = times_in(name)

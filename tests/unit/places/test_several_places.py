@@ -27,7 +27,7 @@ from ros2_memory.places.placed_standstills import PlacedStandstill, stood_at
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import along_x, boolean, octets, odom, text, tf_of, write_mcap, write_splits
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, clause, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import S
 from tests.support.noting_reader import NotingReader
@@ -35,8 +35,8 @@ from tests.support.rooms import BEGIN, ROOMS, asked_of, bounds, draw, write
 from tests.support.tables import table
 
 T0 = 1_700_000_000 * S
-HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
-CARRYING = {"topic": "/bumper", "condition_type": "equals", "value": True}
+HELLO = clause("/chatter", "contains", "hello")
+CARRYING = clause("/bumper", "equals", True)
 
 
 @pytest.fixture(scope="module")
@@ -169,10 +169,9 @@ def test_a_way_that_began_inside_before_the_window_begins_with_the_first_pose_of
     tmp_path: Path,
 ) -> None:
     poses = [odom(T0 + (4 * nth + 1) * S // 4, nth / 10) for nth in range(40)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
     span = {"start": T0 // S + 5, "end": T0 // S + 15}
     inside = {"where": {"x": 0, "y": 0, "radius_m": 9}}
-    driven = asked(memory_of(tmp_path), "trajectory_summary", **span, **inside)
+    driven = asked(remembered(tmp_path, poses), "trajectory_summary", **span, **inside)
     assert driven["start"] == driven["waypoints"][0]["timestamp"] == T0 // S + 5.25
     assert (driven["end"], driven["duration_s"], driven["avg_speed"]) == (T0 // S + 14.25, 9, 0.1)
 
@@ -234,7 +233,7 @@ def test_a_while_of_a_topic_that_fell_silent_says_for_how_long_it_is_not_known(
         found = asked(memory, name, **given, **span, **by, **{"while": CARRYING})
         unknown_s = table(found)["all"]["unknown_s"] if by else found["unknown_s"]
         assert unknown_s == pytest.approx(60, abs=0.1)
-        unmet = {"topic": "/bumper", "condition_type": "above", "value": 3}
+        unmet = clause("/bumper", "above", 3)
         refused = asked(memory, name, **given, **span, **by, **{"while": unmet})
         assert refused["error"] == "invalid_arguments"
         absent = {**CARRYING, "topic": "/absent"}
@@ -310,14 +309,11 @@ def test_places_of_several_frames_are_refused_by_the_name_of_the_argument(
     assert reply["detail"].startswith(f"{argument}: hall is in odom, dock is in base_dock")
 
 
-@each_way
-def test_what_no_message_of_another_topic_can_meet_is_refused(
-    tmp_path: Path, *, recalls: bool
-) -> None:
+def test_what_no_message_of_another_topic_can_meet_is_refused(remember: Remember) -> None:
     messages = [odom(MAP_BEGIN), octets(MAP_BEGIN, [1] * 60), boolean(MAP_BEGIN, True)]
     messages.append(text(MAP_BEGIN + S, "cup"))
-    memory = remembered(tmp_path, messages, recalls=recalls)
-    cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup"}
+    memory = remember(messages)
+    cup = clause("/chatter", "contains", "cup")
     one = {"condition_type": "equals", "value": 1}
     for during, said in (
         ({"topic": "/odom", **one, "field": "nope"}, "no field"),
@@ -333,12 +329,11 @@ def test_a_while_is_answered_from_the_store_and_reads_few_messages(tmp_path: Pat
     """A bag of hours would be decompressed for them."""
     flags = [boolean(T0 + nth * S // 2, nth // 40 % 2 == 0) for nth in range(400)]
     hellos = [text(T0 + nth * S, "hello") for nth in range(200)]
-    write_mcap(
-        tmp_path / "rec" / "rec_0.mcap", sorted([*flags, *hellos], key=attrgetter("log_time"))
-    )
     reader = NotingReader()
-    memory = memory_of(tmp_path, reader=reader, recalls=True)
-    during = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    memory = remembered(
+        tmp_path, sorted([*flags, *hellos], key=attrgetter("log_time")), reader=reader, recalls=True
+    )
+    during = clause("/bumper", "equals", True)
     reader.read.clear()
     reply = asked(memory, "find_matches", by="hour", **HELLO, **{"while": during})
     assert reply["all"][reply["columns"].index("count") - 1] == 5
@@ -355,7 +350,7 @@ def test_what_a_rare_topic_said_last_is_looked_up_once_for_all_matches(tmp_path:
         write_mcap(bags / "rec" / "rec_0.mcap", [state, *hellos])
         reader = NotingReader()
         memory = memory_of(bags, reader=reader, recalls=True)
-        during = {"topic": "/state", "condition_type": "equals", "value": "SCOUTING"}
+        during = clause("/state", "equals", "SCOUTING")
         reader.asked.clear()
         reply = asked(memory, "find_matches", limit=100, **HELLO, **{"while": during})
         assert reply["total"] == matches
@@ -364,13 +359,12 @@ def test_what_a_rare_topic_said_last_is_looked_up_once_for_all_matches(tmp_path:
     assert looks(20) == looks(3)
 
 
-@each_way
 def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of_a_place(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """Drives 0.5 m/s along x, and turns 0.3 rad/s meanwhile, as a holonomic robot may."""
     messages = [odom(MAP_BEGIN + n * S // 10, n / 20, 0.0, 0.03 * n) for n in range(900)]
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     window = {"start": MAP_BEGIN / S, "end": MAP_BEGIN / S + 90}
     where = {"x": [15, 20], "y": [-1, 1]}
     inside = asked(memory, "trajectory_summary", where=where, **window)
@@ -453,14 +447,13 @@ def test_what_is_no_point_is_named(memory: Memory, given: dict[str, Any], said: 
     assert said in reply["detail"]
 
 
-@each_way
 def test_a_path_by_transforms_is_whole_where_a_bag_reaches_from_1970_to_now(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """The clock was set while it was recorded: of half a million hours two have messages."""
     times = [20 * S, *(MAP_BEGIN + n * S // 10 for n in range(300))]
     poses = [tf_of(at, "odom", "base_link", (1.0, 0, 0)) for at in times]
-    memory = remembered(tmp_path, poses, recalls=recalls)
+    memory = remember(poses)
     # Each look at the clock takes 10 ms.
     call = Call(Deadline.after(20.0, partial(next, count(0.0, 0.01))))
     found = trajectory_summary(memory, call, TimeRange(0.0, MAP_BEGIN / S + 30))

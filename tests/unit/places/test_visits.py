@@ -38,7 +38,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock, in_zone
 from tests.support.examples import LONG, examples
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import Remember, asked, clause, memory_of, remembered, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.tables import table
 
@@ -109,7 +109,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     [hint] = [each for each in found.notes if "x and y were taken in map" in each]
     assert hint.endswith('get_position_*: ask with frame_id "odom"')
     window = {"start": T0, "end": T0 + 9, "where": pasted}
-    driven = {"topic": "/odom", "condition_type": "above", "value": -1, "field": "position.x"}
+    driven = clause("/odom", "above", -1, field="position.x")
     for tool, given_ in (
         ("visits", {**pasted, "by": "hour"}),
         ("recap", window),
@@ -166,14 +166,13 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
             assert each.already_inside or arrived >= start * S
 
 
-@each_way
 @pytest.mark.parametrize("nth", [3, -1])
 def test_a_pose_that_cannot_be_decoded_hides_no_visit(
-    tmp_path: Path, nth: int, *, recalls: bool
+    tmp_path: Path, remember: Remember, nth: int
 ) -> None:
     way = line((20.0, 0.1))
     way[nth] = replace(way[nth], body=way[nth].payload[:40])
-    memory = remembered(tmp_path, way, recalls=recalls)
+    memory = remember(way)
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
@@ -198,8 +197,8 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
 
 
 HERE = {"x": 0.0, "y": 0.0, "radius_m": 1.0}
-PRESSED = {"topic": "/bumper", "condition_type": "equals", "value": True}
-CALM = {"topic": "/mood", "condition_type": "equals", "value": "calm"}
+PRESSED = clause("/bumper", "equals", True)
+CALM = clause("/mood", "equals", "calm")
 
 
 def life(seconds: int, silent: Mapping[str, Sequence[tuple[int, int]]]) -> list[Msg]:
@@ -273,7 +272,7 @@ def test_a_state_that_is_said_every_six_seconds_is_rare_and_lasts_through_a_paus
 
 @pytest.mark.parametrize("split_s", [10.0, 60.0, 10_000.0])
 def test_a_fault_of_a_node_holds_from_its_message_to_its_next_one_while_others_are_well(
-    tmp_path: Path, split_s: float
+    tmp_path: Path, remember: Remember, split_s: float
 ) -> None:
     """However bags are cut; a node that says nothing more is gone after an hour."""
     hot = {10: (2, "hot"), 90: (0, "ok"), 200: (2, "hot")}
@@ -282,17 +281,15 @@ def test_a_fault_of_a_node_holds_from_its_message_to_its_next_one_while_others_a
     messages += [diagnostics(BEGIN + n * S, motor=level) for n, level in hot.items()]
     messages += [boolean(BEGIN + n * S, n % 20 == 0) for n in range(0, 4000, 10)]
     write_splits(tmp_path, messages, split_s)
-    while_hot: dict[str, Any] = {
-        "while": {"topic": "/diagnostics", "condition_type": "contains", "value": "hot"}
-    }
-    for memory in (memory_of(tmp_path), memory_of(tmp_path, recalls=True)):
-        [visit] = asked(memory, "visits", **HERE, **while_hot)["visits"]
-        assert visit["duration_s"] == pytest.approx(80 + 3600)
-        window = {"start": T0, "end": T0 + 199}
-        [visit] = asked(memory, "visits", **HERE, **while_hot, **window)["visits"]
-        assert visit["duration_s"] == pytest.approx(80)
-        found = asked(memory, "find_matches", **PRESSED, **while_hot, **window, limit=100)
-        assert [row["first_seen"] - T0 for row in found["sightings"]] == [80, 60, 40, 20]
+    while_hot: dict[str, Any] = {"while": clause("/diagnostics", "contains", "hot")}
+    memory = remember()
+    [visit] = asked(memory, "visits", **HERE, **while_hot)["visits"]
+    assert visit["duration_s"] == pytest.approx(80 + 3600)
+    window = {"start": T0, "end": T0 + 199}
+    [visit] = asked(memory, "visits", **HERE, **while_hot, **window)["visits"]
+    assert visit["duration_s"] == pytest.approx(80)
+    found = asked(memory, "find_matches", **PRESSED, **while_hot, **window, limit=100)
+    assert [row["first_seen"] - T0 for row in found["sightings"]] == [80, 60, 40, 20]
 
 
 @pytest.mark.filterwarnings("error")
@@ -441,8 +438,9 @@ def test_with_two_topics_of_transforms_a_time_is_known_where_both_were_read(
         at, x = BEGIN + nth * S // 10, 5.0 if 550 <= nth < 650 else 0.0
         messages.append(tf_of(at, "base_link", "arm", (0, 0, nth % 5)))
         messages.append(tf(at + 5, transform(at, "odom", "base_link", (x, 0, 0)), topic="/own/tf"))
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, limits=QuerySettings(tf_topics=("/tf", "/own/tf")))
+    memory = remembered(
+        tmp_path, messages, split_s=10, limits=QuerySettings(tf_topics=("/tf", "/own/tf"))
+    )
     known_since: set[int | None] = set()
     for looks in range(0, 60, 2):
         deadline = Deadline.after(looks, count().__next__)
@@ -474,7 +472,7 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
     memory = memory_of(tmp_path, recalls=recalls)
     memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
-    hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+    hello = clause("/chatter", "contains", "hello")
 
     def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
         return table(asked(memory, tool, **given))[row]
@@ -513,10 +511,9 @@ def test_a_fixed_frame_of_an_arm_on_a_rail_is_named_as_the_map(
     assert "changes with every start" not in notes
 
 
-@each_way
 @pytest.mark.parametrize("frames", [("odom", "map"), ("map", "odom")])
 def test_a_robot_whose_poses_are_in_another_frame_since_an_update_was_there_before_it_too(
-    tmp_path: Path, frames: tuple[str, str], *, recalls: bool
+    tmp_path: Path, remember: Remember, frames: tuple[str, str]
 ) -> None:
     for nth, frame_id in enumerate(frames):
         messages = []
@@ -525,7 +522,7 @@ def test_a_robot_whose_poses_are_in_another_frame_since_an_update_was_there_befo
             pose.body.header.frame_id = frame_id  # type: ignore[attr-defined]
             messages += [tf(at, transform(at, "map", "odom", (5.0, 0.0, 0.0))), pose]
         write_mcap(tmp_path / f"rec{nth}" / f"rec{nth}_0.mcap", messages)
-    reply = asked(memory_of(tmp_path, recalls=recalls), "visits", x=5.0, y=0.0, radius_m=1.0)
+    reply = asked(remember(), "visits", x=5.0, y=0.0, radius_m=1.0)
     assert (reply["frame_id"], reply["total"], reply["minutes"]) == ("map", 2, 1.97)
     assert "no transform places" not in str(reply)
     assert "unknown_s" not in reply
