@@ -32,11 +32,10 @@ from tests.support.bags import (
     odom,
     text,
     write_mcap,
-    write_splits,
 )
 from tests.support.clocks import in_zone
 from tests.support.examples import examples
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import Remember, asked, clause, memory_of, remembered
 from tests.support.moving_map import BEGIN as MAP_BEGIN
 from tests.support.moving_map import write_moving_map
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
@@ -69,7 +68,16 @@ windows = st.builds(
 )
 
 
-@given(windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES), st.data())
+def bin_of(bins: TimeBins, at: int) -> str:
+    return bins.names[int(bins.member[bins.pieces([at])[0]].argmax())]
+
+
+in_zones = given(
+    windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES), st.data()
+)
+
+
+@in_zones
 def test_every_time_is_in_the_bin_of_its_local_time(
     window: TimeWindow, by: ClockBin, name: str, data: st.DataObject
 ) -> None:
@@ -82,7 +90,7 @@ def test_every_time_is_in_the_bin_of_its_local_time(
         "weekday": local.strftime("%A"),
         "hour": f"{local.hour:02d}:00",
     }[by]
-    assert bins.names[int(bins.member[bins.pieces([when])[0]].argmax())] == expected
+    assert bin_of(bins, when) == expected
     assert bins.day_of is not None
     assert bins.day_of[bins.pieces([when])[0]] == local.date().toordinal() - EPOCH
 
@@ -99,10 +107,10 @@ def test_what_clocks_repeat_is_in_order(name: str, by: ClockBin, begin: str) -> 
         for at in range(window.start, window.stop, 60 * S):
             local = datetime.fromtimestamp(at // S, UTC).astimezone()
             expected = local.date().isoformat() if by == "day" else f"{local.hour:02d}:00"
-            assert bins.names[int(bins.member[bins.pieces([at])[0]].argmax())] == expected
+            assert bin_of(bins, at) == expected
 
 
-@given(windows, st.sampled_from(["day", "hour", "weekday"]), st.sampled_from(ZONES), st.data())
+@in_zones
 def test_spans_are_shared_out_without_loss(
     window: TimeWindow, by: ClockBin, name: str, data: st.DataObject
 ) -> None:
@@ -171,17 +179,15 @@ NESTED = (
 )
 
 
-@each_way
 def test_an_hour_without_poses_has_no_metres_one_in_which_the_robot_stands_has_zero(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """It drives for an hour, has no odometry for an hour, and stands for an hour."""
     begin = 1_784_001_600
     messages = [boolean((begin + t) * S, True) for t in range(0, 3 * H, 5)]
     messages += [odom((begin + t) * S, t * 0.01) for t in range(0, H, 5)]
     messages += [odom((begin + t) * S, 36.0) for t in range(2 * H, 3 * H, 5)]
-    write_splits(tmp_path, messages, 600)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(messages, split_s=600)
     with in_zone("UTC"):
         window = {"start": begin, "end": begin + 3 * H - 1, "by": "hour"}
         rows = asked(memory, "trajectory_summary", **window)["rows"]
@@ -209,20 +215,26 @@ def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(tmp_path: Path
     assert "places overlap: what is in two of them counts to both" in reply["notes"]
 
 
+def departs(bag_dir: Path, begin: int) -> None:
+    """It is driving from ten seconds after a time on."""
+    messages = [boolean((begin + at) * S, at >= 10, topic="/is_driving") for at in range(20)]
+    write_mcap(bag_dir / f"{begin}.mcap", messages)
+
+
+DEPARTED = clause("/is_driving", "equals", True, by="day")
+
+
 def test_the_first_of_a_day_is_not_known_where_the_window_begins_after_others(
     tmp_path: Path,
 ) -> None:
     midnight = round(datetime(2026, 3, 2).astimezone().timestamp())
     for day, hour in ((0, 8), (0, 17), (1, 9), (2, 8)):
-        begin = midnight + day * 86_400 + hour * 3600
-        messages = [boolean((begin + at) * S, at >= 10, topic="/is_driving") for at in range(20)]
-        write_mcap(tmp_path / f"{begin}.mcap", messages)
+        departs(tmp_path, midnight + day * 86_400 + hour * 3600)
     memory = memory_of(tmp_path)
-    asks = {"topic": "/is_driving", "condition_type": "equals", "value": True, "by": "day"}
 
     def usual_first(start_h: float) -> tuple[str, str, int]:
         span = {"start": midnight + start_h * 3600, "end": midnight + 3 * 86_400}
-        usual = asked(memory, "find_matches", **asks, **span)["usual_first"]
+        usual = asked(memory, "find_matches", **DEPARTED, **span)["usual_first"]
         return usual["earliest"], usual["latest"], usual["days"]
 
     assert usual_first(0) == usual_first(7) == usual_first(8) == ("08:00:10", "09:00:10", 3)
@@ -235,7 +247,7 @@ def test_an_episode_of_the_evening_before_is_not_the_first_of_a_day(tmp_path: Pa
     messages = [text((midnight + hour * H) * S, word, "/task") for hour, word in said]
     messages += [odom((midnight + at) * S) for at in range(20 * H, 55 * H, 60)]
     memory = remembered(tmp_path, messages)
-    asks = {"topic": "/task", "condition_type": "equals", "value": "charge", "by": "day"}
+    asks = clause("/task", "equals", "charge", by="day")
     span = {"start": midnight + 24 * H, "end": midnight + 48 * H}
     reply = asked(memory, "find_matches", **asks, **span)
     day = table(reply)["2026-03-03"]
@@ -253,7 +265,7 @@ def test_a_text_that_holds_through_a_gap_has_no_row_for_hours_without_recording(
         messages = [odom((begin + at) * S) for at in recorded]
         texts = [text((begin + at) * S, said[at], "/task") for at in recorded if at in said]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [*texts, *messages])
-    asks = {"topic": "/task", "condition_type": "equals", "value": "nap", "by": "hour"}
+    asks = clause("/task", "equals", "nap", by="hour")
     reply = asked(memory_of(tmp_path), "find_matches", start=begin, end=begin + 4 * H, **asks)
     rows = table(reply)
     assert [*rows] == ["08:00", "11:00", "all"]
@@ -263,10 +275,9 @@ def test_a_text_that_holds_through_a_gap_has_no_row_for_hours_without_recording(
     assert "no rows for times in which nothing was recorded: 09:00 to 10:00" in reply["notes"]
 
 
-@each_way
 @pytest.mark.parametrize("topic", [SEEN, "/state"])
 def test_what_goes_on_from_before_a_window_counts_where_it_began(
-    tmp_path: Path, topic: str, recalls: bool
+    remember: Remember, topic: str
 ) -> None:
     """A person is in view from 60 to 130 s and from 150 to 160 s, missed for 2 s now and then."""
     messages = []
@@ -276,8 +287,8 @@ def test_what_goes_on_from_before_a_window_counts_where_it_began(
         is_seen = is_there and (topic != SEEN or second not in {100, 101})
         words = ["person"] if is_seen else []
         messages += [odom(at), detections(at, words), text(at, str(words), "/state")]
-    memory = remembered(tmp_path, messages, recalls=recalls)
-    asks = {"topic": topic, "condition_type": "contains", "value": "person", "by": "day"}
+    memory = remember(messages)
+    asks = clause(topic, "contains", "person", by="day")
 
     def counted(first: float, last: float) -> tuple[int, float | None]:
         span = {"start": BEGIN + first, "end": BEGIN + last}
@@ -294,16 +305,12 @@ def test_the_evening_before_clocks_go_forward_is_no_part_of_the_next_day(tmp_pat
     with in_zone(BERLIN):
         noon = round(datetime(2026, 3, 29, 10, tzinfo=UTC).timestamp())
         for begin in (noon - 12 * H, noon):  # 23:00 in winter time, and 12:00 in summer time
-            messages = [
-                boolean((begin + at) * S, at >= 10, topic="/is_driving") for at in range(20)
-            ]
-            write_mcap(tmp_path / f"{begin}.mcap", messages)
-        asks = {"topic": "/is_driving", "condition_type": "equals", "value": True, "by": "day"}
-        reply = asked(memory_of(tmp_path), "find_matches", start=noon, end=noon + H, **asks)
+            departs(tmp_path, begin)
+        reply = asked(memory_of(tmp_path), "find_matches", start=noon, end=noon + H, **DEPARTED)
     assert reply["usual_first"]["earliest"] == "12:00:10"
 
 
-ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
+ANY = clause(SEEN, "contains", "", by="label")
 
 
 def expected(
@@ -363,8 +370,7 @@ def test_each_label_has_what_the_messages_say_of_it_while_the_robot_was_there(
     assert counts == sorted(counts, reverse=True)
 
 
-@each_way
-def test_a_label_that_two_fields_may_name_is_one_label(tmp_path: Path, recalls: bool) -> None:
+def test_a_label_that_two_fields_may_name_is_one_label(remember: Remember) -> None:
     """Once a blank label made a label of the other field, 0 cups were in view at once."""
     kind, named = "own_msgs/msg/NamedTwice", [[("cup", "cup")] * 3, [("", "box"), ("", "cup")]]
     messages = []
@@ -372,7 +378,7 @@ def test_a_label_that_two_fields_may_name_is_one_label(tmp_path: Path, recalls: 
         seen = [make(kind, label=label, class_name=name, score=0.9) for label, name in names]
         body = make(f"{kind}Array", detections=seen)
         messages.append(Msg(SEEN, f"{kind}Array", (BEGIN + nth) * S, body))
-    rows = table(asked(remembered(tmp_path, messages, recalls=recalls), "find_matches", **ANY))
+    rows = table(asked(remember(messages), "find_matches", **ANY))
     assert (rows["cup"]["most_at_once"], rows["box"]["most_at_once"]) == (3, 1)
 
 
@@ -417,18 +423,16 @@ def test_counts_of_labels_say_that_they_are_of_detections_alone(tmp_path: Path) 
 T = 1_790_000_000
 
 
-@each_way
-def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, recalls: bool) -> None:
+def test_labels_in_json_are_compared_one_by_one(remember: Remember) -> None:
     both, butter = ["Knife", "butter knife"], ["butter knife"]
     seen = [both if at < 20 else butter for at in range(40)]
     messages = [
         text((T + at) * NS_PER_S, json.dumps({"objects": [{"label": label} for label in labels]}))
         for at, labels in enumerate(seen)
     ]
-    write_splits(tmp_path, messages, 10)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(messages, split_s=10)
     for kind, value in (("equals", "knife"), ("contains_word", "knife -butter")):
-        sought = {"topic": "/chatter", "condition_type": kind, "value": value}
+        sought = clause("/chatter", kind, value)
         answer = asked(memory, "find_matches", **sought)
         assert [each["count"] for each in answer["sightings"]] == [20]
         newest = asked(memory, "find_last_match", **sought)
@@ -448,7 +452,7 @@ def cups(at: int, *numbers: int) -> Msg:
     return detected(at, things, topic="/detections")
 
 
-def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> None:
+def test_how_long_a_key_of_a_text_of_json_held_is_counted(remember: Remember) -> None:
     """As of deliveries, each of which has some states; the newest text is an empty one."""
     states = [("D1", "loading"), ("D1", "done"), (), ("D2", "loading"), ("D2", "failed"), ()]
     why = [{}, {"why": "lost"}, {}, {}, {}, {}]
@@ -459,20 +463,19 @@ def test_how_long_a_key_of_a_text_of_json_held_is_counted(tmp_path: Path) -> Non
     said = [text((T + 10 * at) * S, report) for at, report in enumerate(reports)]
     bumped = [boolean((T + at) * S, at == 33) for at in range(60)]
     window = {"start": T, "end": T + 59}
-    plain = remembered(tmp_path, [*said, *bumped])
-    for memory in (plain, with_store(plain, tmp_path)):
-        ask = partial(asked, memory, "get_topic_in_range", topic="/chatter", **window)
-        for field in ("data.id", "value.id"):
-            rows = ask(by="value", fields=[field])["rows"]
-            assert [row[:3] for row in rows] == [["D1", 1, 20.0], ["D2", 1, 20.0]]
-        changes = ask(changes=True, fields=["data.is.state"])["changes"]
-        assert [change["value"] for change in changes] == ["loading", "done", "loading", "failed"]
-        bump = {"topic": "/bumper", "condition_type": "equals", "value": True}
-        reply = asked(memory, "find_matches", **bump, **{"with": "/chatter.data.id"})
-        assert reply["sightings"][0]["with"][0]["value"] == "D2"
-        assert "has no field" in ask(by="value", fields=["data.name"])["detail"]
-        changes = ask(changes=True, fields=["data.why"])["changes"]
-        assert [change["value"] for change in changes] == [None, "lost", None]
+    memory = remember([*said, *bumped])
+    ask = partial(asked, memory, "get_topic_in_range", topic="/chatter", **window)
+    for field in ("data.id", "value.id"):
+        rows = ask(by="value", fields=[field])["rows"]
+        assert [row[:3] for row in rows] == [["D1", 1, 20.0], ["D2", 1, 20.0]]
+    changes = ask(changes=True, fields=["data.is.state"])["changes"]
+    assert [change["value"] for change in changes] == ["loading", "done", "loading", "failed"]
+    bump = clause("/bumper", "equals", True)
+    reply = asked(memory, "find_matches", **bump, **{"with": "/chatter.data.id"})
+    assert reply["sightings"][0]["with"][0]["value"] == "D2"
+    assert "has no field" in ask(by="value", fields=["data.name"])["detail"]
+    changes = ask(changes=True, fields=["data.why"])["changes"]
+    assert [change["value"] for change in changes] == [None, "lost", None]
 
 
 @pytest.mark.parametrize(
@@ -500,12 +503,11 @@ def test_what_a_condition_finds_in_a_text_of_json_has_a_length(
     assert [change["value"] for change in reply["changes"]] == values
 
 
-@each_way
-def test_what_could_not_be_decoded_ends_what_was_known(tmp_path: Path, recalls: bool) -> None:
+def test_what_could_not_be_decoded_ends_what_was_known(remember: Remember) -> None:
     """b held for 20 s, though what was said meanwhile is not known, and nothing told so."""
     torn = Msg("/chatter", "std_msgs/msg/String", (T + 20) * S, b"")
     said = [text((T + at) * S, word) for at, word in ((0, "a"), (10, "b"), (30, "a"), (60, "c"))]
-    memory = remembered(tmp_path, in_order([*said, torn]), recalls=recalls)
+    memory = remember(in_order([*said, torn]))
     ask = partial(asked, memory, "get_topic_in_range", topic="/chatter")
     reply = ask(start=T, end=T + 59, by="value")
     assert [row[:3] for row in reply["rows"]] == [["a", 2, 39.0], ["b", 1, 10.0]]
@@ -535,16 +537,14 @@ def test_numbers_that_replies_show_alike_are_one_value(tmp_path: Path) -> None:
     ]
 
 
-@each_way
 def test_a_thing_in_view_as_a_window_begins_or_ends_is_so_whatever_else_is_asked(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """With a score or a place that it had all the time it counted as come into view."""
     seen = [detections((T + at) * S, ["cup"] if at < 40 else []) for at in range(60)]
     poses = [odom((T + at) * S, 0.0, 0.0) for at in range(60)]
-    write_splits(tmp_path, [*seen, *poses], 20)
-    memory = memory_of(tmp_path, recalls=recalls)
-    sought = {"topic": "/vision/*/*", "condition_type": "contains", "value": "cup", "by": "hour"}
+    memory = remember([*seen, *poses], split_s=20)
+    sought = clause("/vision/*/*", "contains", "cup", by="hour")
     here: dict[str, Any] = {"where": {"x": [-1, 1], "y": [-1, 1]}}
     for scope in ({}, {"min_score": 0.5}, here):
         for start, end, *expected in (
@@ -558,31 +558,26 @@ def test_a_thing_in_view_as_a_window_begins_or_ends_is_so_whatever_else_is_asked
             assert [whole["count"], whole["seconds"]] == expected
 
 
-@each_way
 @pytest.mark.parametrize(
     ("write_seen", "field", "value"),
     [(tags, "detections.id", 7), (cups, "detections.label", "cup")],
     ids=["tag", "label"],
 )
 def test_a_thing_that_a_detector_misses_for_a_moment_counts_once(
-    tmp_path: Path, recalls: bool, write_seen: Callable[..., Msg], field: str, value: str | int
+    remember: Remember, write_seen: Callable[..., Msg], field: str, value: str | int
 ) -> None:
     """Two visits of 30 s, in which every fifth message misses it: the field names what is seen."""
     seen = [
         write_seen((T + at) * NS_PER_S, *([4] if at % 5 == 2 else [4, 7] if at % 60 < 30 else []))
         for at in range(120)
     ]
-    write_splits(tmp_path, seen, 40)
-    memory = memory_of(tmp_path, recalls=recalls)
-    sought = {"topic": "/detections", "condition_type": "equals", "field": field, "value": value}
+    memory = remember(seen, split_s=40)
+    sought = clause("/detections", "equals", value, field=field)
     whole = table(asked(memory, "find_matches", **sought, by="day"))["all"]
     assert (whole["count"], whole["seconds"]) == (2, pytest.approx(58, abs=4))
 
 
-@each_way
-def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(remember: Remember) -> None:
     """A text for 100 s, then a boolean; true for 10 s of 20, and nothing or false in between."""
     said = [
         text((T + at) * NS_PER_S, "true" if at % 20 < 10 else "no", "/on")
@@ -590,8 +585,7 @@ def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
     ]
     said += [boolean((T + at) * NS_PER_S, at % 20 < 10, "/on") for at in range(100, 200, 2)]
     said += [odom((T + at) * NS_PER_S, 1.0, 0.0, topic="/on") for at in range(200, 220, 2)]
-    write_splits(tmp_path, said, 40)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(said, split_s=40)
     window = {"topic": "/on", "start": T, "end": T + 198}
     on = {**window, "condition_type": "contains", "value": "true"}
     found = asked(memory, "find_matches", **on, limit=20)

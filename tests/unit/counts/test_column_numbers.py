@@ -27,7 +27,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.clocks import in_zone
-from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.memories import Remember, asked, memory_of, with_store
 from tests.support.tables import table
 
 S = 10**9
@@ -184,7 +184,6 @@ def write_numbers(bag_dir: Path, *values: tuple[str, float]) -> None:
     write_splits(bag_dir, messages)
 
 
-@each_way
 @pytest.mark.parametrize(
     ("kind", "numbers"),
     [
@@ -196,10 +195,10 @@ def write_numbers(bag_dir: Path, *values: tuple[str, float]) -> None:
     ],
 )
 def test_the_least_and_greatest_of_whole_numbers_are_exact(
-    tmp_path: Path, kind: str, numbers: list[int], recalls: bool
+    tmp_path: Path, remember: Remember, kind: str, numbers: list[int]
 ) -> None:
     write_numbers(tmp_path, *((kind, number) for number in numbers))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     given = {"topic": "/number", "start": T0, "end": T0 + 9, "fields": ["value"]}
     extremes = asked(memory, "get_topic_in_range", **given)["extremes"]["value"]
     assert (extremes["min"], extremes["max"]) == (min(numbers), max(numbers))
@@ -236,15 +235,14 @@ def test_tiny_numbers_keep_their_digits_and_noise_beside_others_does_not(tmp_pat
 
 
 @in_zone("UTC")
-@each_way
 def test_what_was_used_in_an_hour_is_its_first_number_less_its_last(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """Messages without a number are none of them; a list has neither."""
     levels = [0.9 - n / 1000 if n % 60 else math.nan for n in range(180)]
     messages = [battery(BEGIN + n * 60 * S, level) for n, level in enumerate(levels)]
     write(tmp_path, [*messages, octets(BEGIN + 10_790 * S, [1, 2, 3])])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     span = {"start": BEGIN // S, "end": BEGIN // S + 3 * HOUR, "by": "hour"}
     given = {"topic": "/battery_state", "fields": ["percentage"], **span}
     hours = table(asked(memory, "get_topic_in_range", **given))
@@ -257,11 +255,9 @@ def test_what_was_used_in_an_hour_is_its_first_number_less_its_last(
     assert (row["data.first"], row["data.last"], row["data.min"]) == (None, None, 1)
 
 
-@each_way
-def test_numbers_in_an_object_have_extremes_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+def test_numbers_in_an_object_have_extremes_one_by_one(remember: Remember) -> None:
     driven = [odom(BEGIN + n * S, x=float(n), y=-2.0 * n, yaw=0.1 * n) for n in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(driven)
     window = {"start": BEGIN // S, "end": BEGIN // S + 10}
     given = {"topic": "/odom", **window, "fields": ["position", "orientation"]}
     extremes = asked(memory, "get_topic_in_range", **given)["extremes"]

@@ -3,6 +3,7 @@
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -19,7 +20,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.clocks import FixedClock
-from tests.support.memories import asked, each_way, memory_of, remembered
+from tests.support.memories import Remember, asked, clause, each_way, memory_of, remembered
 from tests.support.tables import table
 
 S = 10**9
@@ -39,14 +40,18 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@each_way
+@patch("ros2_memory.analysis.topic_events.MAX_EVENTS", 25)
 def test_of_more_changes_than_memory_holds_the_first_are_counted_and_a_note_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+    remember: Remember,
 ) -> None:
     """It toggles each second for 100 s; no question may know of more than 25 changes."""
-    monkeypatch.setattr("ros2_memory.analysis.topic_events.MAX_EVENTS", 25)
-    write_splits(tmp_path, [boolean(T0 + at * S, at % 2 == 1, BUMPER) for at in range(100)], 10)
-    counted = matches(memory_of(tmp_path, recalls=recalls), BUMPER, 0, 99, by="day")
+    counted = matches(
+        remember([boolean(T0 + at * S, at % 2 == 1, BUMPER) for at in range(100)], split_s=10),
+        BUMPER,
+        0,
+        99,
+        by="day",
+    )
     whole = table(counted)["all"]
     assert (whole["count"], whole["seconds"], whole["last_unix"]) == (13, 12, T0 / S + 25)
     assert f"{BUMPER} changes too often to count all: {99 - 25} more" in counted["notes"]
@@ -76,9 +81,8 @@ def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_windo
         assert (whole["seconds"], whole["count"]) == (held, began), (topic, first, last)
 
 
-@each_way
 def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """auto from 0 to 45 s and from 70 s on; bumped from 20 to 30, from 40 to 50 and from 80 s.
 
@@ -90,8 +94,8 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     messages += [text(T0 + at * S, words, "/mode") for at, words in said]
     messages += along_x(T0, 101, mps=0.1)
     write_splits(tmp_path, messages, 600, layout=McapLayout(latched=frozenset({"/mode"})))
-    memory = memory_of(tmp_path, recalls=recalls)
-    bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
+    memory = remember()
+    bumped = clause(BUMPER, "equals", True)
     auto = {"topic": "/mode", "condition_type": "contains", "value": "auto", "while": bumped}
     found = asked(memory, "find_matches", **auto)
     rows = [(row["first_seen"] - T0 / S, row["duration_s"]) for row in found["sightings"]]
@@ -111,24 +115,21 @@ def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
     assert [row["first_seen"] for row in inside["sightings"]] == [T0 / S + 20]
 
 
-@each_way
 def test_by_counts_a_boolean_that_is_said_when_it_changes_from_its_first_message_on(
-    tmp_path: Path, recalls: bool
+    remember: Remember,
 ) -> None:
     """Nothing is recorded from 100 to 110 s, so when it began to be true at 115 s is not known."""
     changes = (0, False), (60, True), (65, False), (90, True), (91, False), (95, True), (96, False)
     messages = [boolean(T0 + at * S, value, BUMPER) for at, value in (*changes, (115, True))]
     messages += [odom(T0 + at * S, 0.0, 0.0) for at in range(120) if not 100 <= at < 110]
-    write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember(messages, split_s=10)
     for first, began in ((0, 3), (50, 3), (61, 2), (92, 1), (98, 0)):
         counted = matches(memory, BUMPER, first, 120, by="hour")
         assert table(counted)["all"]["count"] == began, first
 
 
-@each_way
 def test_a_boolean_that_is_said_when_it_changes_holds_from_before_the_window_and_to_its_end(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """True from 50 s on and from 800 s on; after the pause from 2499 s on it is not known."""
     said = ((10, False), (50, True), (600, False), (800, True))
@@ -136,7 +137,7 @@ def test_a_boolean_that_is_said_when_it_changes_holds_from_before_the_window_and
         messages = [boolean(T0 + at * S, value, DOCKED) for at, value in said if at in recorded]
         messages += [odom(T0 + at * S, 0.0, 0.0) for at in recorded]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     windows = (0, 3000, 2249, 2), (100, 900, 600, 1), (100, 500, 400, 0), (700, 3000, 1699, 1)
     for first, last, held, began in windows:
         whole = table(matches(memory, DOCKED, first, last, by="day"))["all"]
@@ -152,8 +153,7 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     bumped = [45 <= at < 130 or 160 <= at < 162 for at in times]
     messages = [boolean(T0 + at * S, *said) for at, *said in zip(times, bumped, strict=True)]
     messages += along_x(T0, 300)
-    write_splits(tmp_path, messages, split_s)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path, messages, split_s=split_s, recalls=recalls)
 
     def whole(first: int, last: int, by: str = "hour") -> list[float]:
         answer = table(matches(memory, BUMPER, first, last, by=by))["all"]
@@ -167,18 +167,18 @@ def test_a_boolean_does_not_hold_through_a_silence_of_its_topic(
     assert whole(79, 95) == whole(85, 95) == [0, 0]
 
 
-@each_way
 def test_a_boolean_of_a_rare_topic_holds_to_the_ends_of_the_window_but_not_after_a_gap(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """As of a dock; nothing is recorded from 7999 to 8500 s, or on."""
     changes = ((100, False), (4000, True), (5000, False), (6000, True))
     messages = [boolean(T0 + at * S, value, BUMPER) for at, value in changes]
-    write_splits(tmp_path, [*messages, *along_x(T0, 8000)], 2000)
-    found = matches(memory_of(tmp_path, recalls=recalls), BUMPER, 0, 10_000)["sightings"]
+    found = matches(remember([*messages, *along_x(T0, 8000)], split_s=2000), BUMPER, 0, 10_000)[
+        "sightings"
+    ]
     assert [row["duration_s"] for row in found] == [1999, 1000]
     write_splits(tmp_path, along_x(T0 + 8500 * S, 1501), 2000)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     matched = partial(matches, memory, BUMPER)
     found = matched(0, 10_000)["sightings"]
     assert [row["duration_s"] for row in found] == [1999, 1000]
@@ -218,9 +218,8 @@ def test_no_value_holds_from_one_clock_to_the_next(tmp_path: Path) -> None:
     assert of_1970["all"]["last_unix"] == UNSET + 1
 
 
-@each_way
 def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """In two runs a mission says what it does when that changes, first after 10 s."""
     for begin in (0, 2000):
@@ -228,8 +227,8 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
         states = [text(T0 + (begin + at) * S, word, "/mission") for at, word in said]
         messages = [odom(T0 + (begin + at) * S, 0.0) for at in range(0, 1001, 2)]
         write_splits(tmp_path, [*states, *messages], 100, f"run{begin}")
-    given = {"topic": "/mission", "condition_type": "equals", "value": "CHARGING", "by": "day"}
-    memory = memory_of(tmp_path, recalls=recalls)
+    given = clause("/mission", "equals", "CHARGING", by="day")
+    memory = remember()
     whole = table(asked(memory, "find_matches", **given))["all"]
     assert (whole["count"], whole["seconds"]) == (4, 2 * 690)
     assert whole["topic_s"] == pytest.approx(2 * 990, abs=1)
@@ -238,27 +237,23 @@ def test_what_a_rare_topic_said_counts_as_said_until_its_next_message(
     assert [row["seconds"] for row in episodes] == [300, 390, 300, 390]
 
 
-@each_way
-def test_a_rare_measurement_that_falls_silent_is_not_known_any_more(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_rare_measurement_that_falls_silent_is_not_known_any_more(remember: Remember) -> None:
     levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
-    memory = remembered(tmp_path, in_order([*levels, *along_x(T0, 1001)]), recalls=recalls)
+    memory = remember(in_order([*levels, *along_x(T0, 1001)]))
     given = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
     reply = asked(memory, "find_matches", value=0, by="day", **given)
     assert table(reply)["all"]["topic_s"] == pytest.approx(400, abs=1)
 
 
-@each_way
 def test_a_while_on_a_rare_measurement_ends_where_that_falls_silent(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     levels = [battery(T0 + at * S, 0.5) for at in range(0, 401, 5)]
     moving = along_x(T0, 1001)
     other = [boolean(T0 + at * S, True) for at in range(1001)]
     write_splits(tmp_path, [*levels, *moving, *other], 100)
     charged = {"topic": "/battery_state", "field": "percentage", "condition_type": "above"}
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     scope = {"while": {**charged, "value": 0.2}}
     counted = matches(memory, BUMPER, 0, 1000, by="day", **scope)
     whole = table(counted)["all"]

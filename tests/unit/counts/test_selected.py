@@ -1,15 +1,14 @@
 """One element of a list, selected by what one of its fields says: `status[name=left].level`."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ros2_memory.history.context import Memory
 from ros2_memory.messages.conversions import Selector, segments_of
-from tests.support.bags import Msg, diagnostics, text, write_mcap
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.bags import Msg, diagnostics, text
+from tests.support.memories import Remember, asked
 
 T0_S = 1_700_000_000
 S = 10**9
@@ -34,9 +33,8 @@ def messages() -> list[Msg]:
 
 
 @pytest.fixture
-def memory(tmp_path: Path, messages: list[Msg], recalls: bool) -> Memory:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    return memory_of(tmp_path, recalls=recalls)
+def memory(remember: Remember, messages: list[Msg]) -> Memory:
+    return remember(messages)
 
 
 def spans(memory: Memory, topic: str, **condition: Any) -> list[tuple[int, int]]:
@@ -47,7 +45,6 @@ def spans(memory: Memory, topic: str, **condition: Any) -> list[tuple[int, int]]
     ]
 
 
-@each_way
 def test_a_condition_is_tested_on_the_selected_element_alone(memory: Memory) -> None:
     warns = {"condition_type": "above", "value": 0}
     assert spans(memory, "/diagnostics", field="status[name=left].level", **warns) == [(30, 49)]
@@ -59,7 +56,6 @@ def test_a_condition_is_tested_on_the_selected_element_alone(memory: Memory) -> 
     assert spans(memory, "/diagnostics", field="status[name=none].level", **warns) == []
 
 
-@each_way
 def test_json_has_selected_elements_too(memory: Memory) -> None:
     gone = {"condition_type": "equals", "value": 0}
     assert spans(memory, "/shelf", field="data.items[name=oat milk].stock", **gone) == [(80, 95)]
@@ -68,7 +64,6 @@ def test_json_has_selected_elements_too(memory: Memory) -> None:
     assert spans(memory, "/shelf", field="data.items[stock=0].name", **out) == [(80, 95)]
 
 
-@each_way
 def test_fields_show_the_selected_elements(memory: Memory) -> None:
     given = {"timestamp": T0_S + 40, "fields": ["status[name=left].level", "status[level=1].name"]}
     reply = asked(memory, "get_topic_at_time", topic="/diagnostics", **given)
@@ -89,7 +84,6 @@ def test_fields_show_the_selected_elements(memory: Memory) -> None:
     assert (least, greatest) == (0, 4)
 
 
-@each_way
 def test_never_says_which_elements_there_are_if_none_is_selected(memory: Memory) -> None:
     asking = {"condition_type": "above", "value": 0, "field": "status[name=lift].level"}
     [note] = asked(memory, "find_last_match", topic="/diagnostics", **asking)["notes"]
@@ -135,7 +129,6 @@ def test_an_element_is_selected_by_a_text_a_number_or_a_boolean(
     assert Selector("id", wanted).accepts(value) is is_selected
 
 
-@each_way
 def test_a_field_that_no_element_has_is_refused(memory: Memory) -> None:
     asking = {"condition_type": "above", "value": 0, "field": "status[name=left].height"}
     refused = asked(memory, "find_matches", topic="/diagnostics", **asking, **RIGHT)
