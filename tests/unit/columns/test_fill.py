@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -23,7 +24,7 @@ from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import BagReader, Batch
 from ros2_memory.storage.mcap import bulk
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, odom, set_mtime, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.column_worlds import World, check_all, store_file, times
 
@@ -49,7 +50,7 @@ def count(bag_dir: Path, table: str) -> int:
 
 
 def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     for number in range(4):
         write_bag(tmp_path, number)
@@ -60,8 +61,7 @@ def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty
             raise ValueError("of a test")
         return read_columns(plan, batch)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(decode, "read_columns", failing)
+    with patch.object(decode, "read_columns", failing):
         world.fill()
     assert world.stored() == {f"rec/rec_{number}.mcap" for number in (0, 1, 3)}
     check_all(world)
@@ -147,7 +147,7 @@ def test_a_bag_in_which_the_clock_was_set_ahead_by_years_fits_into_a_cache_folde
     years = 7 * 365 * 86_400 * S
     messages = [odom(at + n * S, n / 10, 0.0) for at in (T0 - years, T0) for n in range(60)]
     path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
-    os.utime(path, ns=(T0, T0))
+    set_mtime(path, T0)
     world = World.of(bag_dir, files=[tmp_path / "cache" / "columns.sqlite"], limits=StoreLimits())
     world.fill()
     assert world.stored() == {"rec/rec_0.mcap"}
@@ -167,7 +167,7 @@ def write_long_bag(bag_dir: Path) -> None:
         for message in (odom(at, at / S, 0.0), text(at + 5, f"word {at}"))
     ]
     path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
-    os.utime(path, ns=(T0, T0))
+    set_mtime(path, T0)
 
 
 @pytest.fixture
@@ -214,7 +214,7 @@ def replace_store(bag_dir: Path) -> None:
     for path in store_file(bag_dir).parent.glob(f"{store_file(bag_dir).name}*"):
         path.unlink()
     path = write_mcap(bag_dir / "other" / "other_0.mcap", [odom(T0 + 10**6 * S, 0, 0)])
-    os.utime(path, ns=(T0, T0))
+    set_mtime(path, T0)
     other = World.of(bag_dir)
     bags = other.memory.index.snapshot().bags
     other.fill_alone([bag for bag in bags if bag.path == path])

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -142,10 +143,8 @@ def driven(number: int) -> list[Msg]:
     return [odom(T0 + (number * 60 + n) * 5 * S, number + n / 300, 0.1) for n in range(60)]
 
 
-def test_what_was_made_in_time_is_told_before_the_time_is_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(scan, "STRETCH_NS", 1200 * S)
+@patch.object(scan, "STRETCH_NS", 1200 * S)
+def test_what_was_made_in_time_is_told_before_the_time_is_over(tmp_path: Path) -> None:
     for number in range(12):
         write_mcap(tmp_path / f"rec_{number // 6}" / f"{number}.mcap", driven(number))
     world = World.of(tmp_path)

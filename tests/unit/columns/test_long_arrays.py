@@ -21,10 +21,10 @@ from tests.support.bags import (
     quaternion,
     stamp,
     typestore,
-    write_mcap,
 )
-from tests.support.memories import asked, each_way, memory_of, remembered, with_store
+from tests.support.memories import Remember, asked, clause, remembered, with_store
 from tests.support.noting_reader import NotingReader
+from tests.support.tables import table
 
 T0 = 1_790_000_000 * NS_PER_S
 
@@ -45,17 +45,16 @@ def grid() -> Msg:
     return Msg("/data", kind, T0, make(kind, header=header(0, "map"), info=info, data=unknown))
 
 
-@each_way
 @pytest.mark.parametrize("field", ["position.nope", "positions.nope"])
 def test_a_joint_that_no_message_names_is_answered_with_those_that_they_do(
-    tmp_path: Path, field: str, recalls: bool
+    remember: Remember, field: str
 ) -> None:
     """Two nodes publish joints of one robot."""
     messages: list[Msg] = []
     for nth in range(0, 20, 2):
         messages.append(joint_state(nth, ["elbow", "wrist"], [nth / 10, 1.0]))
         messages.append(joint_state(nth + 1, ["wheel"], [nth]))
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     ask = partial(asked, memory, topic="/joints")
     window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 19}
     note = f"the newest messages of /joints have no {field}, but name elbow, wheel, wrist"
@@ -80,15 +79,14 @@ def test_a_joint_that_no_message_names_is_answered_with_those_that_they_do(
         assert "but name" not in str(reply)
 
 
-@each_way
 @pytest.mark.parametrize("message", [grid(), octets(T0, [7] * 100, "/data")], ids=lambda m: m.type)
 def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
-    tmp_path: Path, message: Msg, recalls: bool
+    remember: Remember, message: Msg
 ) -> None:
-    memory = remembered(tmp_path, [message], recalls=recalls)
+    memory = remember([message])
     tried = ("above", 50), ("below", 0), ("equals", 100), ("equals", -1), ("contains", 10)
     for condition, number in tried:
-        asks = {"topic": "/*", "condition_type": condition, "value": number}
+        asks = clause("/*", condition, number)
         ask = partial(asked, memory, "find_last_match", **asks)
         assert "ask about data.bytes" in ask(field="data")["detail"]
         if condition == "equals":  # in the whole message
@@ -114,7 +112,7 @@ def arm(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:
     ],
 )
 def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
-    tmp_path: Path,
+    remember: Remember,
     made: Callable[[int, Sequence[str], Sequence[float]], Msg],
     count: int,
     field: str,
@@ -132,28 +130,27 @@ def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
             stated.append(angles["elbow"])
         if angles.get("elbow", 0.0) > 0.5:
             bent.append(T0 / NS_PER_S + nth)
-    plain = remembered(tmp_path, messages)
+    memory = remember(messages)
     states = [is_bent for is_bent, _ in groupby(angle > 0.5 for angle in stated)]
     window = {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 40}
     elbow = {"condition_type": "above", "value": 0.5, "field": field}
     left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
-    for memory in (plain, with_store(plain, tmp_path)):
-        ask = partial(asked, memory, topic="/joints")
-        assert ask(name="find_last_match", **elbow)["timestamp"] == bent[-1]
-        runs = ask(name="find_matches", **elbow, limit=100)["sightings"]
-        assert sum(run["count"] for run in runs) == len(bent)
-        assert len(runs) == states.count(True)
-        of_elbow = partial(ask, name="get_topic_in_range", fields=[field], **window)
-        shown = [angle for _, angle in of_elbow(max_samples=40)["rows"]]
-        assert shown == pytest.approx(stated, abs=1e-6)
-        of_hour = of_elbow(by="hour")
-        ends = dict(zip(of_hour["columns"][1:], of_hour["all"], strict=True))
-        assert ends[f"{field}.min"] == pytest.approx(min(stated), abs=1e-6)
-        assert ends[f"{field}.max"] == pytest.approx(max(stated), abs=1e-6)
-        assert ask(name="find_last_match", **left) is None
-        refused = ask(name="find_last_match", **{**elbow, "field": "positions.knee"})
-        assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")
-        assert "their fields are: positions." in refused["detail"]
+    ask = partial(asked, memory, topic="/joints")
+    assert ask(name="find_last_match", **elbow)["timestamp"] == bent[-1]
+    runs = ask(name="find_matches", **elbow, limit=100)["sightings"]
+    assert sum(run["count"] for run in runs) == len(bent)
+    assert len(runs) == states.count(True)
+    of_elbow = partial(ask, name="get_topic_in_range", fields=[field], **window)
+    shown = [angle for _, angle in of_elbow(max_samples=40)["rows"]]
+    assert shown == pytest.approx(stated, abs=1e-6)
+    of_hour = of_elbow(by="hour")
+    ends = table(of_hour)["all"]
+    assert ends[f"{field}.min"] == pytest.approx(min(stated), abs=1e-6)
+    assert ends[f"{field}.max"] == pytest.approx(max(stated), abs=1e-6)
+    assert ask(name="find_last_match", **left) is None
+    refused = ask(name="find_last_match", **{**elbow, "field": "positions.knee"})
+    assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")
+    assert "their fields are: positions." in refused["detail"]
 
 
 def test_long_arrays_beside_empty_ones_are_found_where_columns_were_dropped(
@@ -188,15 +185,12 @@ def test_joints_that_others_publish_between_end_no_sighting_where_columns_were_d
         assert bending["count"] == 40
 
 
-@each_way
-def test_a_joint_holds_its_value_while_another_publisher_names_others(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_joint_holds_its_value_while_another_publisher_names_others(remember: Remember) -> None:
     messages = list[Msg]()
     for nth in range(0, 12, 2):
         messages += [joint_state(nth, ["lift"], [0.5 * (nth >= 6)])]
         messages += [joint_state(nth + 1, ["elbow", "wrist"], [0.1 * nth, 0.0])]
-    memory = remembered(tmp_path, messages, recalls=recalls)
+    memory = remember(messages)
     window = {"topic": "/joints", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 11}
     lift = partial(asked, memory, "get_topic_in_range", **window, fields=["positions.lift"])
     held = [(row["seconds"], row["value"]) for row in lift(changes=True)["changes"]]
@@ -217,27 +211,26 @@ def test_a_joint_holds_its_value_while_another_publisher_names_others(
     )
 
 
-def test_samples_of_a_joint_are_messages_that_name_it(tmp_path: Path) -> None:
+def test_samples_of_a_joint_are_messages_that_name_it(remember: Remember) -> None:
     messages = list[Msg]()
     for nth in range(0, 40, 2):
         messages += [joint_state(nth, ["lift"], [nth / 10]), joint_state(nth + 1, ["elbow"], [0.0])]
     messages += [joint_state(40 + nth, ["elbow"], [0.0]) for nth in range(10)]
-    plain = remembered(tmp_path, messages)
+    memory = remember(messages)
     begin = T0 / NS_PER_S
-    for memory in (plain, with_store(plain, tmp_path)):
-        samples = partial(asked, memory, "get_topic_in_range", topic="/joints")
-        lift = partial(samples, fields=["positions.lift"])
-        few = lift(start=begin, end=begin + 39, max_samples=3)
-        assert few["rows"] == [[begin, 0], [begin + 18, 1.8], [begin + 38, 3.8]]
-        assert few["total"] == 40
-        every = lift(start=begin + 10, end=begin + 15)
-        assert [row[1] for row in every["rows"]] == [1, 1.2, 1.4]
-        assert every["notes"] == ["3 samples left out, without any of the fields"]
-        both = samples(fields=["positions.lift", "positions.elbow"], start=begin, end=begin + 1)
-        assert [row[1:] for row in both["rows"]] == [[0, None], [None, 0]]
-        none = lift(start=begin + 41, end=begin + 45)
-        assert (none["error"], none["reason"]) == ("no_data", "between_messages")
-        assert none["detail"].endswith("in this time say nothing of positions.lift")
+    samples = partial(asked, memory, "get_topic_in_range", topic="/joints")
+    lift = partial(samples, fields=["positions.lift"])
+    few = lift(start=begin, end=begin + 39, max_samples=3)
+    assert few["rows"] == [[begin, 0], [begin + 18, 1.8], [begin + 38, 3.8]]
+    assert few["total"] == 40
+    every = lift(start=begin + 10, end=begin + 15)
+    assert [row[1] for row in every["rows"]] == [1, 1.2, 1.4]
+    assert every["notes"] == ["3 samples left out, without any of the fields"]
+    both = samples(fields=["positions.lift", "positions.elbow"], start=begin, end=begin + 1)
+    assert [row[1:] for row in both["rows"]] == [[0, None], [None, 0]]
+    none = lift(start=begin + 41, end=begin + 45)
+    assert none["reason"] == "between_messages"
+    assert none["detail"].endswith("in this time say nothing of positions.lift")
 
 
 def test_joints_of_a_robot_with_many_are_compared_without_reading_each_message(
@@ -247,11 +240,10 @@ def test_joints_of_a_robot_with_many_are_compared_without_reading_each_message(
     names = ["elbow", *map("joint_{}".format, range(15))]
     angles = [0.9 if nth < 120 else 0.1 for nth in range(200)]
     messages = [joint_state(nth, names, [angle, *[2.0] * 15]) for nth, angle in enumerate(angles)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
     reader = NotingReader()
-    memory = memory_of(tmp_path, reader=reader, recalls=True)
+    memory = remembered(tmp_path, messages, reader=reader, recalls=True)
     reader.read.clear()
-    bent = {"topic": "/joints", "condition_type": "above", "field": "positions.elbow", "value": 0.5}
+    bent = clause("/joints", "above", 0.5, field="positions.elbow")
     [sighting] = asked(memory, "find_matches", **bent)["sightings"]
     assert (sighting["count"], sighting["duration_s"]) == (120, 120.0)
     assert len(reader.read) < 20

@@ -1,7 +1,6 @@
 """The file of the store may be anything at any time; what its rows mean is pinned, and shown."""
 
 import hashlib
-import os
 import re
 import sqlite3
 import struct
@@ -32,6 +31,7 @@ from tests.support.bags import (
     goals,
     log_entry,
     odom,
+    set_mtime,
     text,
     tf,
     tf_of,
@@ -54,7 +54,7 @@ def write_bags(bag_dir: Path) -> None:
         messages += [detections(start + S, ["cup", f"thing {number}"]), battery(start + 2 * S, 0.7)]
         messages += [text(start + 3 * S, ""), text(start + 4 * S, "Straße")]
         path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
-        os.utime(path, ns=(T0, T0))
+        set_mtime(path, T0)
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def write_all_that_is_derived(bag_dir: Path) -> None:
     half = len(messages) // 2
     for folder, some in (("rec", messages), ("beside", messages[half:])):
         path = write_mcap(bag_dir / folder / f"{folder}_0.mcap", some)
-        os.utime(path, ns=(T0, T0))
+        set_mtime(path, T0)
 
 
 def stored_rows(file: Path) -> str:
@@ -380,7 +380,7 @@ def test_columns_that_are_dropped_and_bytes_of_each_topic(tmp_path: Path) -> Non
             odom(start + n * S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9)) for n in range(300)
         ]
         path = write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-        os.utime(path, ns=(T0, T0))
+        set_mtime(path, T0)
     World.of(tmp_path, limits=StoreLimits(max_share=0.0)).fill()
 
     def answer(question: str) -> list[Any]:

@@ -19,11 +19,11 @@ from ros2_memory.index.scan import ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import odom, set_mtime, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.heartbeats import beat
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import Remember, asked
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 from tests.unit.core.test_deep_directories import within
 
@@ -135,7 +135,7 @@ class World:
         """Beside a file, be it there or not."""
         if deed == "replace":
             other = plain(path.with_name("incoming"), [number], closed=number % 3 != 0)
-            os.utime(other, ns=(self.clock.at,) * 2)
+            set_mtime(other, self.clock.at)
             other.rename(path)
         elif deed == "drop folder" and path.parent != self.root:
             shutil.rmtree(path.parent)
@@ -151,10 +151,10 @@ class World:
         """The file system's clock is the test's: it stamps what was touched."""
         if path.is_file():
             self._held.enter_context(path.open("rb"))
-            os.utime(path, ns=(self.clock.at,) * 2)
+            set_mtime(path, self.clock.at)
         for folder in path.parents:
             if folder.is_relative_to(self.root) and folder.is_dir():
-                os.utime(folder, ns=(self.clock.at,) * 2)
+                set_mtime(folder, self.clock.at)
 
 
 @settings(max_examples=examples(300))
@@ -194,14 +194,14 @@ LONG_AGO = NOW - 3600 * S
 def put(path: Path, text: str = "x") -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
-    os.utime(path, ns=(LONG_AGO, LONG_AGO))
+    set_mtime(path, LONG_AGO)
     return path
 
 
 def aged(root: Path) -> Path:
     """Gives every directory an mtime that proves that nothing came or went since."""
     for folder in (root, *(path for path in root.rglob("*") if path.is_dir())):
-        os.utime(folder, ns=(LONG_AGO, LONG_AGO))
+        set_mtime(folder, LONG_AGO)
     return root
 
 
@@ -282,32 +282,30 @@ def write_odometry(path: Path, speed: float, later: int = 0) -> Path:
     begin = 1_784_000_000 * S
     poses = [odom(begin + later + n * S, speed * n, 0.0) for n in range(10)]
     write_mcap(path, poses)
-    os.utime(path, ns=(begin, begin))
+    set_mtime(path, begin)
     return path
 
 
-@each_way
 def test_bags_with_pauses_of_their_own_share_what_they_say_of_topics(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """Else 6,000 bags of a robot that stalls in each take 30 MB in place of 10, and gaps 8 s."""
     for split in range(2):
         begin = (1_784_000_000 + 10 * split) * S
         poses = [odom(begin + n * S // 10, 0.0) for n in range(90) if not 20 < n < 40 + split]
         write_mcap(tmp_path / "rec" / f"rec_{split}.mcap", poses)
-    timeline = memory_of(tmp_path, recalls=recalls).index.snapshot().timeline
+    timeline = remember().index.snapshot().timeline
     one, other = (bag.summary.schema for bag in timeline.bags)
     assert one.pauses != other.pauses
     assert one.topics is other.topics
     assert one.positions is other.positions
 
 
-@each_way
-def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) -> None:
+def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, remember: Remember) -> None:
     path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
     for name in ("rec_0 (copy).mcap", "another.mcap"):
         shutil.copy2(path, path.with_name(name))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert [bag.file for bag in memory.index.snapshot().bags] == [str(path)]
     for file in (path, path.with_name("another.mcap")):
         [odometry] = asked(memory, "list_recorded_topics")
@@ -315,9 +313,8 @@ def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) ->
         file.unlink()
 
 
-@each_way
 def test_a_copy_of_the_second_of_two_runs_with_equal_times_counts_once(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """As of a simulation: the copy is compared with both, not with the first alone."""
     runs = [
@@ -325,18 +322,17 @@ def test_a_copy_of_the_second_of_two_runs_with_equal_times_counts_once(
     ]
     assert runs[0].stat().st_size == runs[1].stat().st_size
     shutil.copy2(runs[1], runs[1].with_name("b (copy).mcap"))
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert [bag.path for bag in memory.index.snapshot().bags] == runs
     [odometry] = asked(memory, "list_recorded_topics")
     assert odometry["count"] == 20
 
 
-@each_way
 def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
 
     def driven() -> float:
         of_all = {"start": 1_784_000_000, "end": 1_784_000_099}
@@ -346,21 +342,22 @@ def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
     before, other = path.stat(), write_odometry(tmp_path / "other", 0.2, later=S).read_bytes()
     with path.open("r+b") as stream:
         stream.write(other)
-    os.utime(path, ns=(before.st_mtime_ns, before.st_mtime_ns))
+    set_mtime(path, before.st_mtime_ns)
     assert path.stat()[:7] == before[:7]
     memory.index.refresh()
     assert driven() == 1.8
 
 
-@each_way
 @pytest.mark.parametrize("dated", ["rec_1.mcap", "handover.json"])
-def test_a_file_dated_after_2262_hides_no_bag(tmp_path: Path, recalls: bool, dated: str) -> None:
+def test_a_file_dated_after_2262_hides_no_bag(
+    tmp_path: Path, remember: Remember, dated: str
+) -> None:
     paths = [tmp_path / "rec" / f"rec_{number}.mcap" for number in range(2)]
     for path in paths:
         write_odometry(path, 0.1, later=int(path == paths[1]) * 10 * S)
     put(tmp_path / "rec" / "handover.json", '{"format": 1}')
     os.utime(tmp_path / "rec" / dated, ns=(LONG_AGO, 10_413_792_000 * S))
-    [odometry] = asked(memory_of(tmp_path, recalls=recalls), "list_recorded_topics")
+    [odometry] = asked(remember(), "list_recorded_topics")
     assert odometry["count"] == 20
 
 
@@ -370,7 +367,7 @@ def test_there_are_no_notes_on_closed_bags_even_if_the_clock_is_not_set_yet(
 ) -> None:
     """A robot without a battery-backed clock starts in 1970, with a week of bags."""
     path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(NOW - 7200 * S, 0.0, 0.0)])
-    os.utime(path, ns=(LONG_AGO, LONG_AGO))
+    set_mtime(path, LONG_AGO)
     clock = SettableClock(now)
     index = IndexManager(tmp_path, McapReader(), clock, refresh_s=0.0, split_duration_s=10.0)
     with index.undisturbed() as snapshot:
@@ -391,7 +388,7 @@ def test_a_split_that_a_kill_left_in_both_forms_counts_once(
     packed = path.with_name(f"{path.name}.zstd")
     packed.write_bytes(zstandard.compress(path.read_bytes()))
     for file in (path, packed):
-        os.utime(file, ns=(LONG_AGO, LONG_AGO))
+        set_mtime(file, LONG_AGO)
     memory = memory_of(tmp_path, storage="rosbag2")
     [odometry] = asked(memory, "list_recorded_topics")
     assert odometry["count"] == 9 * bags

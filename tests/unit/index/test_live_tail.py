@@ -1,6 +1,5 @@
 """What answers of a file that is still being written: all that is whole, and nothing else."""
 
-import os
 from collections.abc import Iterator
 from functools import cache
 from io import BytesIO
@@ -20,7 +19,7 @@ from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, mcap_content, odom
+from tests.support.bags import McapLayout, Msg, mcap_content, odom, set_mtime
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, with_store
@@ -85,7 +84,7 @@ class Tail:
             stream.write(content)
             stream.truncate()
         self.clock.at = T0 + at
-        os.utime(path, ns=(T0 + at,) * 2)
+        set_mtime(path, T0 + at)
         return path
 
     def ticks(self, view: View | None = None) -> list[int]:

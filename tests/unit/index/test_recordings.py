@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given
@@ -143,8 +144,7 @@ def test_times_that_recordings_share_are_those_of_all_their_bags(
         odom_bag(f"/bags/r{recording}/{number}.mcap", start, start + length)
         for number, (recording, start, length) in enumerate(drawn)
     ]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timeline, "SEGMENT_BAGS", size)
+    with patch.object(timeline, "SEGMENT_BAGS", size):
         shared = timeline.Timeline.of(bags).shared_times
     assert shared == overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
 

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from random import Random
+from unittest.mock import patch
 
 import numpy as np
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -81,8 +81,7 @@ def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
     chance = Random(seed)
     pool = [_random_bag(chance, number) for number in range(3 * size)]
     present = set(chance.sample(range(len(pool)), chance.choice([0, 1, size, 2 * size])))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timelines, "SEGMENT_BAGS", size)
+    with patch.object(timelines, "SEGMENT_BAGS", size):
         timeline = Timeline.of(pool[number] for number in present)
         for _ in range(rounds):
             assert all(timeline.extents("/odom", TimeWindow.everything()))

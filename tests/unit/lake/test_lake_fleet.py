@@ -24,9 +24,10 @@ from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import ship_from, write_bag
+from tests.support.memories import clause
 
 CHATTER = {"robot": "hall", "topic": "/chatter", "seconds": 1e9}
-CUP = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
+CUP = clause(SEEN, "contains", "cup")
 
 
 def overrides(folder: Path) -> list[str]:
@@ -178,7 +179,7 @@ def test_of_a_day_counts_what_was_shipped_or_what_stayed_if_less_was_shipped(
     found = reply(served(tmp_path), "get_topic_in_last", CHATTER)
     is_needed = shipped == 1
     assert found["total"] == (len(stayed) + 10 * left if is_needed else 10 * shipped)
-    wanted = {"topic": "/chatter", "condition_type": "contains", "value": "n"}
+    wanted = clause("/chatter", "contains", "n")
     last = reply(served(tmp_path), "find_last_match", {**wanted, "robot": "hall"})
     assert last["timestamp"] == START_S + (27 if is_needed else 10 * shipped - 1)
     assert ("only some messages stayed" in str(last)) is is_needed

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 from urllib.request import Request, urlopen
 
 import pytest
@@ -284,12 +284,11 @@ def test_what_ships_for_years_forgets_bags_that_are_gone(tmp_path: Path) -> None
 
 
 def test_read_only_bags_are_shipped_and_reported_and_nothing_is_written_beside_those_of_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     write_bag(tmp_path / "hall", 0)
     own = tmp_path / "hall" / ".episodic"
-    with monkeypatch.context() as patched:
-        patched.setattr(shipper_module, "append_receipts", failing(errno.EROFS))
+    with patch.object(shipper_module, "append_receipts", failing(errno.EROFS)):
         done = ship_from(tmp_path)
     assert done.bags == 1
     [problem] = done.problems
@@ -329,10 +328,8 @@ def test_what_pyiceberg_refuses_is_committed_from_a_fresh_look(
             raise _Killed
         return commit(*given)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(SqlCatalog, "commit_table", kill)
-        with pytest.raises(_Killed):
-            ship(tmp_path, robots, most_bags=200)
+    with patch.object(SqlCatalog, "commit_table", kill), pytest.raises(_Killed):
+        ship(tmp_path, robots, most_bags=200)
     monkeypatch.setattr(_OverwriteFiles, "_deleted_entries", missing)
     for robot in robots:
         robot.look_again()

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import date, timedelta
 from pathlib import Path
 from random import Random
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow as pa
@@ -194,11 +195,11 @@ def test_rows_of_a_bag_are_the_same_whatever_bags_they_are_made_with(
 
 
 @pytest.mark.parametrize("spoiled", [1, 3])
+@patch("ros2_memory.columns.plan.MAX_COLUMNS", 3)
 def test_a_pose_that_cannot_be_decoded_costs_its_bag_alone_the_poses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoiled: int
+    tmp_path: Path, spoiled: int
 ) -> None:
     """Where messages have too many fields for columns, those of all bags are read at once."""
-    monkeypatch.setattr("ros2_memory.columns.plan.MAX_COLUMNS", 3)
     driven = along_x(START_S * NS_PER_S, 40, mps=1.0, hz=2)
     torn = 20 * spoiled + 7
     driven[torn] = replace(driven[torn], body=driven[torn].payload[:40])

@@ -36,7 +36,7 @@ from tests.support.lakes import (
     ship,
     store_columns,
 )
-from tests.support.memories import ROOT, memory_of, with_store
+from tests.support.memories import ROOT, clause, memory_of, with_store
 from tests.support.moving_map import BEGIN, S
 from tests.support.unlike_robots import DAMAGED, LENGTH_S, ROBOTS, SEEN, YEAR_NS
 
@@ -186,7 +186,7 @@ def test_every_question_is_answered_by_two_shares_as_by_the_whole_or_refused(
 
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
-    asked = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
+    asked = clause("/vision/*/*", "contains", "x")
     robots = [replace(robot, in_lake=True) for robot in world.lake.robots.values()]
     *_, note = reply(Fleet(robots, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
@@ -234,7 +234,7 @@ def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: Worl
     percentages = [1 - step / 1000 for step in range(0, 5 * LENGTH_S, 25)]
     of_lost = [row[2:] for row in charge if row[0] == "lost"]
     assert of_lost == [pytest.approx((min(percentages), max(percentages)))]
-    mug = {"topic": "/vision/*/*", "condition_type": "contains", "value": "mug"}
+    mug = clause("/vision/*/*", "contains", "mug")
     matches = reply(world.mounted, "find_last_match", mug)["matches"]
     assert [(row[0], round(row[1], 3)) for row in last] == [
         (row["robot_name"], row["timestamp"]) for row in matches
@@ -254,7 +254,7 @@ def every_question(
     middle = (start_s + end_s) / 2
     cut: dict[str, object] = {"start": middle - 13.3, "end": middle + 9.7}
     spot: dict[str, object] = {"where": {"x": 2.0, "y": 3.0, "radius_m": 1.5}}
-    match: dict[str, object] = {"topic": seen, "condition_type": "contains", "value": label}
+    match: dict[str, object] = clause(seen, "contains", label)
     for topic in topics:
         at = {"topic": topic, "timestamp": draw.uniform(start_s, end_s), "tolerance_s": 5}
         yield "get_topic_at_time", at
