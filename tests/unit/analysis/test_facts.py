@@ -1,8 +1,8 @@
 import math
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,11 +31,9 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 
 
-def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(topic_events, "MAX_EVENTS", 10)
-    monkeypatch.setattr(topic_events, "MAX_INTERVALS", 10)
+@patch.object(topic_events, "MAX_EVENTS", 10)
+@patch.object(topic_events, "MAX_INTERVALS", 10)
+def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold() -> None:
     parts = []
     for nth in range(15):
         at = nth * 100 * NS_PER_S

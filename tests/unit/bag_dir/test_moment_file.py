@@ -29,6 +29,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
+from tests.support.bags import set_mtime
 from tests.support.fakes import broken
 
 S = 10**9
@@ -121,7 +122,7 @@ def test_requests_and_answers_that_nobody_waits_for_are_swept_away(tmp_path: Pat
     assert list(queue.take(T0 + STALE_NS + 1)) == []
     [name] = names(tmp_path)
     assert name == f"{posted.request.number}.answer"
-    os.utime(tmp_path / REQUESTS_FOLDER / name, ns=(T0, T0))
+    set_mtime(tmp_path / REQUESTS_FOLDER / name, T0)
     for after_s, left in ((500, [name]), (700, [])):
         assert list(queue.take(T0 + after_s * S)) == []
         assert names(tmp_path) == left

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from structlog.testing import capture_logs
@@ -64,8 +65,8 @@ def test_a_list_that_is_deleted_while_recording_is_written_again_whole(tmp_path:
     assert all(map(OwnRecordings(tmp_path).owns, made))
 
 
-def test_the_list_stays_small_over_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_recordings, "_SPARE_LINES", 20)
+@patch.object(own_recordings, "_SPARE_LINES", 20)
+def test_the_list_stays_small_over_years(tmp_path: Path) -> None:
     own, made = OwnRecordings(tmp_path), [tmp_path / f"rec_{number}" for number in range(80)]
     for number, path in enumerate(made):
         own.begin(path.name)
@@ -77,10 +78,8 @@ def test_the_list_stays_small_over_years(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(map(own.owns, made[-3:]))
 
 
-def test_two_programs_that_write_lose_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(own_recordings, "_SPARE_LINES", 5)
+@patch.object(own_recordings, "_SPARE_LINES", 5)
+def test_two_programs_that_write_lose_nothing(tmp_path: Path) -> None:
     own_all(tmp_path)
     made = [tmp_path / f"rec_{number}" for number in range(60)]
     for path in made:
@@ -149,10 +148,10 @@ def test_a_line_that_says_nothing_is_left_out_and_told(tmp_path: Path, line: Any
     assert events(logs, "recordings_list_damaged")
 
 
+@patch.object(own_recordings, "_SPARE_LINES", 0)
 def test_a_recording_that_is_about_to_begin_stays_listed_when_the_list_is_written_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(own_recordings, "_SPARE_LINES", 0)
     own = claimed(tmp_path)
     own.begin(A)
     (tmp_path / A).mkdir()
@@ -176,14 +175,14 @@ def test_what_another_program_listed_is_known_where_the_list_cannot_be_written(
     assert old
 
     def adopting_first(path: Path) -> AbstractContextManager[int]:
-        patch.setattr(own_recordings, "locked", locked)
+        patched.setattr(own_recordings, "locked", locked)
         # Another program has the lock, so this one waits.
         OwnRecordings(tmp_path).adopt({"old": old})
-        patch.setattr(json_files, "write_durably", failing())
+        patched.setattr(json_files, "write_durably", failing())
         return locked(path)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(own_recordings, "locked", adopting_first)
+    with monkeypatch.context() as patched:
+        patched.setattr(own_recordings, "locked", adopting_first)
         with pytest.raises(RecorderError, match="No space left"):
             own.begin(B)
     assert own.owns(tmp_path / "old")

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
-from unittest.mock import Mock, call
+from unittest.mock import Mock, call, patch
 
 import pytest
 from hypothesis import given, settings
@@ -339,10 +339,8 @@ def test_losses_are_those_of_a_window_and_the_oldest_are_dropped_but_for_what_wa
     assert len(found) < 60
 
 
-def test_a_publisher_that_is_refused_all_day_hides_nothing_older(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 6000)
+@patch.object(state_files, "MOST_LOST_BYTES", 6000)
+def test_a_publisher_that_is_refused_all_day_hides_nothing_older(tmp_path: Path) -> None:
     forgotten = Loss("/speech", 0, 1, 5, "forgotten")
     append_losses(tmp_path, [forgotten])
     for hour in range(24):
@@ -354,10 +352,8 @@ def test_a_publisher_that_is_refused_all_day_hides_nothing_older(
     assert united(refused) == [(T0, spans[-1][1])]
 
 
-def test_all_that_expired_is_known_however_often_the_robot_was_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "_MOST_EXPIRED", 20)
+@patch.object(state_files, "_MOST_EXPIRED", 20)
+def test_all_that_expired_is_known_however_often_the_robot_was_off(tmp_path: Path) -> None:
     expired, hour = Expired(), 3600 * 10**9
     for n in range(50):
         loss = Loss("/camera", T0 + n * hour, T0 + n * hour + 10**9, 5, "expired")
@@ -368,10 +364,8 @@ def test_all_that_expired_is_known_however_often_the_robot_was_off(
     assert (len(everything) <= 21, sum(loss.lost for loss in everything)) == (True, 250)
 
 
-def test_rows_that_one_program_appends_while_another_shortens_the_file_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 100)
+@patch.object(state_files, "MOST_LOST_BYTES", 100)
+def test_rows_that_one_program_appends_while_another_shortens_the_file_stay(tmp_path: Path) -> None:
     losses = [Loss("/chatter", T0 + n, T0 + n + 1, 1, "forgotten") for n in range(80)]
     with ThreadPoolExecutor(2) as pool:
         [*pool.map(lambda loss: append_losses(tmp_path, [loss]), losses)]
@@ -393,10 +387,8 @@ def test_an_error_of_who_has_locked_a_file_is_passed_on(tmp_path: Path) -> None:
         raise BlockingIOError("leased")
 
 
-def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "_SPARE_RECEIPTS", 10)
+@patch.object(state_files, "_SPARE_RECEIPTS", 10)
+def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(tmp_path: Path) -> None:
     (tmp_path / "here").touch()
     for number in range(8):
         given = [Receipt(name, "id", number, "00", "hub", 0) for name in (f"gone{number}", "here")]

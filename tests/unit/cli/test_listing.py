@@ -14,6 +14,7 @@ from datetime import datetime
 from functools import partial
 from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import yaml
@@ -290,7 +291,7 @@ def test_where_no_store_can_be_written_index_says_so(
 
 
 def test_index_fails_if_the_store_cannot_be_written(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program, using: Using
+    folder: Path, exits: Program, using: Using
 ) -> None:
     for bag in folder.rglob("*.mcap"):
         os.utime(bag, (1_700_000_000,) * 2)
@@ -304,8 +305,7 @@ def test_index_fails_if_the_store_cannot_be_written(
         error.sqlite_errorcode = sqlite3.SQLITE_FULL
         raise error
 
-    with monkeypatch.context() as full:
-        full.setattr(database, "_transaction", fill_the_disk)
+    with patch.object(database, "_transaction", fill_the_disk):
         failed = exits(2, "index --json")
     assert failed.json["stored"] == 0
     assert "the store of columns cannot be used: database or disk is full" in failed.err

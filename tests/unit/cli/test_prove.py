@@ -3,6 +3,7 @@
 import json
 import shlex
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from mcap.reader import make_reader
@@ -92,11 +93,11 @@ def test_what_lay_between_recordings_needs_a_folder(
     assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
 
 
+@patch("ros2_memory.things.known.READING_S", 0.0)
 def test_a_proof_has_all_that_an_answer_rests_on_however_long_reading_takes(
-    tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, exits: Program
 ) -> None:
     """A server without stored columns would answer from the newest day alone, with a note."""
-    monkeypatch.setattr("ros2_memory.things.known.READING_S", 0.0)
     for day in range(4):
         start = BEGIN + day * DAY_S * S
         seen = [detected(start + nth * S, [("cup", 0.9, (1.0, 0.0, 0.5))]) for nth in range(20)]

@@ -5,6 +5,7 @@ import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
+from unittest.mock import patch
 
 import pytest
 
@@ -93,10 +94,8 @@ def test_a_message_that_comes_once_as_topics_are_measured_is_no_message_a_second
 
 
 @pytest.mark.usefixtures("surveyed")
-def test_who_answers_no_has_nothing_written(
-    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO("n\n"))
+@patch.object(sys, "stdin", io.StringIO("n\n"))
+def test_who_answers_no_has_nothing_written(exits: Program, tmp_path: Path) -> None:
     shown = exits(1, f"up --bag-dir {tmp_path}/bags").out
     assert "record /odom" in shown
     assert not (tmp_path / "bags" / "topics.yaml").exists()

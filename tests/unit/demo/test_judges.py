@@ -1,7 +1,6 @@
 """The demo's questions, asked of a memory over the demo's own bags: right, and able to be wrong."""
 
 import json
-import os
 from dataclasses import dataclass
 
 import pytest
@@ -15,6 +14,7 @@ from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
+from tests.support.bags import set_mtime
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 
@@ -51,7 +51,7 @@ def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
     timeline = MessageSchedule(now - 145 * NS_PER_S, now - 123 * NS_PER_S)
     recorder = DemoRecorder(folder / "flat", timeline, clock=FixedClock(now))
     for path in folder.rglob("*.mcap"):
-        os.utime(path, ns=(now, now))  # however long it took to write them
+        set_mtime(path, now)  # however long it took to write them
     memory = memory_of(folder, clock=FixedClock(now))
     tools = {tool.name: tool for tool in build_tools(memory.limits)}
     replies = Replies(folder, 24_000)

@@ -4,7 +4,6 @@ Of six robots one is damaged, one offline, one goes offline while the server run
 is a year ahead, and the disk of one hangs.
 """
 
-import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
@@ -27,6 +26,7 @@ from ros2_memory.fleet.robots import FanOut, Fleet, Robot
 from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.declaration import Tool
+from tests.support.bags import set_mtime
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, reply_of, seeded, tools_of, write_robot
 from tests.support.memories import memory_of
@@ -70,7 +70,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Six]:
     broken = folder / "damaged" / "rec" / "rec_1.mcap"
     modified = broken.stat().st_mtime_ns
     broken.write_bytes(b"no bag " * 100)
-    os.utime(broken, ns=(modified, modified))
+    set_mtime(broken, modified)
     clock = FixedClock(NOW)
 
     def robot_of(name: str) -> Robot:

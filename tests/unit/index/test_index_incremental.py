@@ -23,7 +23,7 @@ from tests.support.bags import odom, set_mtime, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.heartbeats import beat
-from tests.support.memories import Remember, asked
+from tests.support.memories import Remember, asked, memory_of
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 from tests.unit.core.test_deep_directories import within
 

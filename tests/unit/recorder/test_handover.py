@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
@@ -326,10 +327,8 @@ def test_of_a_file_with_a_damaged_chunk_the_cut_leaves_all_other_messages(
     assert "b/b_0.mcap" in "".join(reply["notes"])
 
 
-def test_where_too_many_would_be_listed_all_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(handover, "MOST_LISTED", 5)
+@patch.object(handover, "MOST_LISTED", 5)
+def test_where_too_many_would_be_listed_all_count(tmp_path: Path) -> None:
     old, new = tmp_path / "a", tmp_path / "b"
     Recorder(0, 7.5).writes(old, publications(13))
     Recorder(4, 13, (Stall(5.8, 1),)).writes(new, publications(13))

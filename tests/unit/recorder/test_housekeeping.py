@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 import zstandard
@@ -333,8 +333,7 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     beat = Heartbeat(1, 60, state, (), 10, 0, (), (), None, 2.0)
     write_heartbeat(tmp_path, beat)
     keeper = keeper_of(tmp_path, clock=later(0))
-    with pytest.MonkeyPatch.context() as full:
-        full.setattr("ros2_memory.bag_dir.json_files.append_durably", failing(errno.ENOSPC))
+    with patch("ros2_memory.bag_dir.json_files.append_durably", failing(errno.ENOSPC)):
         keeper.prepare()
     keeper.apply()
     keeper.wait()

@@ -13,6 +13,7 @@ from structlog.testing import capture_logs
 from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
+from tests.support.bags import set_mtime
 from tests.support.clocks import SettableClock
 from tests.support.plain_text_bags import PlainReader, plain
 
@@ -61,7 +62,7 @@ def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
     yard.age()
     yard.scan_after()
     new = yard.split(3, [3])
-    os.utime(new, ns=(LONG_AGO, LONG_AGO))
+    set_mtime(new, LONG_AGO)
     for _ in range(3):
         assert len(yard.scan_after(10).bags) == 4
     assert yard.reader.summaries == {f"rec_{split}.mcap": 1 for split in range(4)}
@@ -95,7 +96,7 @@ def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_oth
     plain(tmp_path / "rec_0.mcap", [1])
     plain(tmp_path / "rec_1.mcap.zstd", [1])
     yard.age()
-    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
+    set_mtime(plain(tmp_path / "rec_0.mcap.zstd", [1]), NOW)
     snapshot = yard.scan_after()
     assert _names(snapshot.bags) == ["rec_0.mcap"]
     assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]

@@ -4,6 +4,7 @@ import errno
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from structlog.testing import capture_logs
@@ -165,11 +166,9 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
     assert deleted_spans(tmp_path) == ((T0, T0 + 89 * S + 1),)
 
 
-def test_times_of_files_that_the_list_has_no_room_for_are_known_as_deleted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@patch.object(state_files, "_MOST_DELETED_BYTES", 4_000)
+def test_times_of_files_that_the_list_has_no_room_for_are_known_as_deleted(tmp_path: Path) -> None:
     """As of a recording of a day, of which every split is deleted but the last."""
-    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 4_000)
     recording(tmp_path, A, 2_000)
     recording(tmp_path, B, 3_000)
     own_all(tmp_path)
@@ -185,10 +184,8 @@ def test_times_of_files_that_the_list_has_no_room_for_are_known_as_deleted(
     assert read_deleted(tmp_path)[B].files == (f"{B}_0.mcap", f"{B}_1.mcap")
 
 
-def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 300)
+@patch.object(state_files, "_MOST_DELETED_BYTES", 300)
+def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(tmp_path: Path) -> None:
 
     starts = [T0 + n * 100 * S for n in range(5)]
     gone = [deleted_of(f"rec_{at}", [("a_0.mcap", at, at + 9 * S)]) for at in starts]

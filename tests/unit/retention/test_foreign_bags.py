@@ -1,7 +1,6 @@
 """Bags that the recorder did not make are neither deleted, repaired nor counted in a limit."""
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
-from tests.support.bags import McapLayout, mcap_content, odom, write_mcap
+from tests.support.bags import McapLayout, mcap_content, odom, set_mtime, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.housekeepers import (
@@ -234,7 +233,7 @@ def test_a_foreign_bag_that_grows_is_measured_anew(tmp_path: Path) -> None:
     reported = list[int | None]()
     for size in sizes:
         session.write_bytes(content[:size])
-        os.utime(session, ns=(NOW, NOW))
+        set_mtime(session, NOW)
         memory.index.refresh()
         reported.append(memory_status(memory, Call()).budget.foreign)
     assert reported == sizes

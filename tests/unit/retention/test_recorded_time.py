@@ -3,7 +3,7 @@
 import errno
 import os
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 from structlog.testing import capture_logs
@@ -35,10 +35,8 @@ def folders(bag_dir: Path, *names: str) -> None:
         (bag_dir / name).mkdir()
 
 
-def test_recordings_that_are_gone_are_dropped_without_a_restart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorded_time, "_SPARE_LINES", 10)
+@patch.object(recorded_time, "_SPARE_LINES", 10)
+def test_recordings_that_are_gone_are_dropped_without_a_restart(tmp_path: Path) -> None:
     folders(tmp_path, "stays")
     time, end = RecordedTime(tmp_path), 0.0
     for name in ("stays", *map(str, range(50))):

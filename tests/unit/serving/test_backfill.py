@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import anyio
 import anyio.lowlevel
@@ -158,10 +159,8 @@ async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
             tasks.cancel_scope.cancel()
 
 
-async def test_much_that_is_put_together_is_left_to_the_helper(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.serving.backfill._MERGED_HERE", 2)
+@patch("ros2_memory.serving.backfill._MERGED_HERE", 2)
+async def test_much_that_is_put_together_is_left_to_the_helper(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
     _, backfill = storing(tmp_path)

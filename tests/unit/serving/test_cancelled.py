@@ -16,7 +16,7 @@ from ros2_memory.storage.base import Batch, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.build import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_splits
-from tests.support.memories import memory_of
+from tests.support.memories import clause, memory_of
 
 S: Final = 10**9
 BEGIN_S: Final = 1_784_000_000
@@ -34,11 +34,11 @@ LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("recap", SPAN),
     ("visits", {"x": 1e5, "y": 0.0}),
     ("list_frames", {}),
-    ("find_matches", {"topic": "/*", "condition_type": "contains", "value": "never"}),
-    ("find_last_match", {"topic": "/vision/*", "condition_type": "contains", "value": "never"}),
+    ("find_matches", clause("/*", "contains", "never")),
+    ("find_last_match", clause("/vision/*", "contains", "never")),
     (
         "find_last_match",
-        {"topic": "/odom", "condition_type": "above", "value": 1e9, "field": "position.x"},
+        clause("/odom", "above", 1e9, field="position.x"),
     ),
     (
         "get_value_when",

@@ -6,7 +6,7 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import anyio
 import anyio.lowlevel
@@ -156,10 +156,8 @@ async def test_a_reply_that_is_not_read_ends_the_connection_and_the_call() -> No
                 served.app.under_way = 0
 
 
-async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(connection_limits, "MAX_CONNECTIONS", 3)
+@patch.object(connection_limits, "MAX_CONNECTIONS", 3)
+async def test_a_connection_too_many_is_told_so_and_the_others_are_served() -> None:
     async with serving() as served:
         open_ones = [await served.connect() for _ in range(3)]
         for reader, writer in open_ones:
@@ -196,10 +194,8 @@ async def test_headers_without_end_and_what_is_no_http_are_refused(head: bytes) 
         await served.gone()
 
 
-async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(connection_limits, "MAX_UNKNOWN", 3)
+@patch.object(connection_limits, "MAX_UNKNOWN", 3)
+async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays() -> None:
     async with serving() as served:
         known, to_known = await served.connect()
         to_known.write(GET)
@@ -224,10 +220,8 @@ async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
         to_known.close()
 
 
-async def test_a_flood_of_one_address_does_not_drop_who_speaks_late_from_another(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(connection_limits, "MAX_UNKNOWN", 8)
+@patch.object(connection_limits, "MAX_UNKNOWN", 8)
+async def test_a_flood_of_one_address_does_not_drop_who_speaks_late_from_another() -> None:
     async with serving() as served:
         reader, writer = await served.connect()
         with ExitStack() as stack:

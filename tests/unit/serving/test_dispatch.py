@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import patch
 
 import anyio
 import pytest
@@ -258,10 +259,10 @@ async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_
     assert dispatcher.blocking.waiting == 0
 
 
-async def test_a_question_behind_a_hanging_disk_is_told_so_soon_and_answered_when_it_is_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("ros2_memory.serving.fair_queue._HANGING_WAIT_S", 0.05)
+@patch("ros2_memory.serving.fair_queue._HANGING_WAIT_S", 0.05)
+async def test_a_question_behind_a_hanging_disk_is_told_so_soon_and_answered_when_it_is_back() -> (
+    None
+):
     held = Held()
     dispatcher = served(tool("read", held.ask), timeout_s=0.2).dispatcher
     async with anyio.create_task_group() as tasks:

@@ -4,6 +4,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import anyio
 import anyio.from_thread
@@ -125,10 +126,8 @@ async def test_a_recorder_that_does_not_record_degrades_it_unless_it_was_stopped
     assert reply.get("problems") == problems
 
 
-async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.serving.health.TIMEOUT_S", 0.001)
+@patch("ros2_memory.serving.health.TIMEOUT_S", 0.001)
+async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(tmp_path: Path) -> None:
     released = threading.Event()
     looks: list[int] = []
 

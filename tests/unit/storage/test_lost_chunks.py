@@ -43,7 +43,7 @@ from tests.support.mcap_surgery import (
     raw_mcap,
     spoil_chunk,
 )
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import Remember, asked, memory_of, with_store
 from tests.support.reader_cases import read_through
 
 S = 10**9
@@ -130,7 +130,7 @@ def test_a_damaged_chunk_is_reported_where_what_is_asked_may_be_in_it(tmp_path: 
 
 
 def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported(
-    tmp_path: Path,
+    tmp_path: Path, remember: Remember
 ) -> None:
     dock = text(10 * S, "docked", "/dock")
     other = text(9 * S, "undocked", "/dock")
@@ -138,12 +138,11 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
     spoil_chunk(first, 1)
     again = Msg("/dock", dock.type, 100 * S, dock.body, 10 * S)
     write_mcap(tmp_path / "b" / "b_0.mcap", [again], LATCHED)
-    plain = memory_of(tmp_path)
-    for memory in (plain, with_store(plain, tmp_path)):
-        asks = {"topic": "/dock", "condition_type": "contains", "value": "docked"}
-        found = asked(memory, "find_last_match", **asks)
-        assert found["timestamp"] == 100
-        assert "a_0.mcap could not be read whole" in found["notes"][0]
+    memory = remember()
+    asks = {"topic": "/dock", "condition_type": "contains", "value": "docked"}
+    found = asked(memory, "find_last_match", **asks)
+    assert found["timestamp"] == 100
+    assert "a_0.mcap could not be read whole" in found["notes"][0]
 
 
 def of_sqlite(code: int) -> sqlite3.OperationalError:

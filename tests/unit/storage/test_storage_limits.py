@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from itertools import count
 from pathlib import Path
+from unittest.mock import patch
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
@@ -118,10 +119,10 @@ def bag(folder: Path, *records: Piece) -> Path:
     ],
     ids=count(),
 )
+@patch("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
 def test_what_is_larger_or_more_than_allowed_is_left_out_and_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, records: list[Piece], said: str
+    tmp_path: Path, records: list[Piece], said: str
 ) -> None:
-    monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
     path, reader = bag(tmp_path, *records), McapReader(max_chunk_mb=1)
     with little_memory(10 * MB):
         summary = reader.summarize(path)
@@ -159,10 +160,8 @@ def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into
     assert "damaged record" in summary.notes[0]
 
 
-def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNK_MESSAGES", 10)
+@patch("ros2_memory.storage.mcap.chunk.MAX_CHUNK_MESSAGES", 10)
+def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused() -> None:
     one = message(1, 5, b"").data
     assert walk_chunk(one * 10).message_count == 10
     with pytest.raises(UnreadableError, match="more than 10 messages"):
@@ -286,11 +285,9 @@ def test_a_file_that_unpacks_to_far_more_than_its_size_is_not_unpacked(tmp_path:
         Rosbag2Reader().summarize(path)
 
 
-def test_a_file_of_more_frames_or_blocks_than_any_writer_makes_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ros2_memory.storage.zstd_bag._MAX_FRAMES", 100)
-    monkeypatch.setattr("ros2_memory.storage.zstd_bag._MAX_BLOCKS", 1000)
+@patch("ros2_memory.storage.zstd_bag._MAX_FRAMES", 100)
+@patch("ros2_memory.storage.zstd_bag._MAX_BLOCKS", 1000)
+def test_a_file_of_more_frames_or_blocks_than_any_writer_makes_is_named(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap.zstd"
     for data in (rle_frame(1) * 101, rle_frame(10)[:6] + b"\x08\0\0x" * 1001):
         path.write_bytes(data)

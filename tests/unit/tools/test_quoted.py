@@ -21,7 +21,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.fleets import fleet_over, reply
-from tests.support.memories import asked, memory_of, replied
+from tests.support.memories import asked, memory_of, remembered, replied
 
 S: Final = 10**9
 T0_S: Final = 1_784_000_000
@@ -184,8 +184,7 @@ def test_a_frame_that_is_named_by_a_sentence_is_marked(
             pose,
             tf_of(at, ATTACK + "frame_id", ATTACK + "child", (n / 10, 0, 0)),
         ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    found = asked(memory_of(tmp_path), tool, **given)
+    found = asked(remembered(tmp_path, messages), tool, **given)
     # Notes are sentences of this program, and name frames as they are.
     require_marked({key: part for key, part in found.items() if key != "notes"})
 

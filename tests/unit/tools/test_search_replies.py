@@ -16,7 +16,7 @@ from tests.support.bags import (
 )
 from tests.support.housekeepers import described, own_all
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import Remember, asked, each_way, memory_of
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -41,16 +41,15 @@ def bag_dir(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@each_way
 def test_that_a_long_array_was_not_searched_is_said_whatever_the_newest_is(
-    tmp_path: Path, *, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     for nth in range(3):
         held = [octets(T0 + (10 * nth + at) * S, [7] * 4) for at in range(3)]
         if nth == 1:
             held.append(octets(T0 + 15 * S, [200] * 60))
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [*held, boolean(T0 + nth * 10 * S, True)])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     note = f"/octets: where data is long it is only summarised, last at {T0_S + 15}.000000"
     for wanted in (
         {"condition_type": "above", "value": 100, "field": "data"},
@@ -99,9 +98,8 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
         ("get_value_when", {"condition_topic": "/rosout", "value_topic": "/bumper"}),
     ],
 )
-@each_way
 def test_that_recording_was_interrupted_is_said_where_nothing_was_found(
-    tmp_path: Path, tool: str, topics: dict[str, str], recalls: bool
+    tmp_path: Path, remember: Remember, tool: str, topics: dict[str, str]
 ) -> None:
     for nth, begin in enumerate((0, 30)):
         beats = range(begin * S, (begin + 10) * S, S // 10)
@@ -109,15 +107,15 @@ def test_that_recording_was_interrupted_is_said_where_nothing_was_found(
         told = [log_entry(T0 + beat + 1, 20, "driver", "on its way") for beat in beats]
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [*beating, *told])
     wanted = {**topics, "condition_type": "contains", "value": "never"}
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     assert asked(memory, tool, **wanted) is None
     (tmp_path / ".episodic").mkdir(exist_ok=True)
     append_losses(tmp_path, [Loss("*", T0 + 10 * S, T0 + 30 * S, 0, "died")])
-    never = asked(memory_of(tmp_path, recalls=recalls), tool, **wanted)
+    never = asked(remember(), tool, **wanted)
     assert (never["timestamp"], never["value"]) == (None, None)
     [note] = never["notes"]
     assert note.endswith("(20.1 s), because ros2 bag record died")
-    early = asked(memory_of(tmp_path, recalls=recalls), tool, **wanted, before=T0_S + 5)
+    early = asked(remember(), tool, **wanted, before=T0_S + 5)
     assert early is None
 
 

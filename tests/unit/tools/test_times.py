@@ -12,7 +12,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import Memory
 from tests.support.bags import boolean, odom, text, tf_of, write_mcap
 from tests.support.clocks import SettableClock, in_zone
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, clause, memory_of, remembered
 from tests.support.program import Program, exits
 
 __all__ = ["exits"]
@@ -25,14 +25,13 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
 ) -> None:
     day = round(datetime.fromisoformat("2026-11-18").timestamp()) * NS_PER_S
     hours = [day + hour * 3600 * NS_PER_S for hour in (-30, -1, 1, 23)]
-    write_mcap(tmp_path / "bag.mcap", [text(at, "here") for at in hours])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [text(at, "here") for at in hours])
     window = {"topic": "/chatter", "start": "2026-11-16", "end": "2026-11-18"}
     assert asked(memory, "get_topic_in_range", **window)["total"] == 4
     for midnight in ("2026-11-18T00:00", "2026-11-18T00", "2026-11-18 00"):
         window["end"] = midnight
         assert asked(memory, "get_topic_in_range", **window)["total"] == 2
-    wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
+    wanted = clause("/chatter", "contains", "here")
     found = asked(memory, "find_last_match", before="2026-11-18", **wanted)
     assert found["timestamp"] == hours[1] / NS_PER_S
 
@@ -45,12 +44,11 @@ def test_a_call_reads_the_clock_once(tmp_path: Path) -> None:
             self.read += 1
             return self.at
 
-    write_mcap(tmp_path / "bag.mcap", [text(S, "here"), text(9 * S, "there")])
-    memory = memory_of(tmp_path)
+    memory = remembered(tmp_path, [text(S, "here"), text(9 * S, "there")])
     for tool, given in (
         ("get_topic_seconds_ago", {"topic": "/chatter", "seconds_ago": 500}),
         ("get_topic_in_range", {"topic": "/chatter", "start": 3, "end": 90}),
-        ("find_last_match", {"topic": "/chatter", "condition_type": "equals", "value": "no"}),
+        ("find_last_match", clause("/chatter", "equals", "no")),
         ("recap", {"start": 3, "end": 90}),
         ("memory_status", {}),
     ):
@@ -75,9 +73,13 @@ def test_a_second_or_a_minute_is_as_long_however_it_is_written(
 ) -> None:
     begin = round(datetime(2026, 11, 18, 4, 41, tzinfo=UTC).timestamp()) * NS_PER_S
     times = range(begin + 2 * NS_PER_S // 10, begin + 120 * NS_PER_S, NS_PER_S // 4)
-    write_mcap(tmp_path / "bag.mcap", [text(at, "here") for at in times])
     window = {"topic": "/chatter", "start": written, "end": written}
-    assert asked(memory_of(tmp_path), "get_topic_in_range", **window).get("total", 0) == total
+    assert (
+        asked(
+            remembered(tmp_path, [text(at, "here") for at in times]), "get_topic_in_range", **window
+        ).get("total", 0)
+        == total
+    )
 
 
 S = 10**9
