@@ -17,7 +17,7 @@ from ros2_memory.columns import database
 from ros2_memory.columns.writing import Writing
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
-from tests.support.memories import asked, assert_same_counts
+from tests.support.memories import asked, assert_same_counts, clause
 from tests.unit.columns.test_fill import T0, S, decode_in_groups, write_bag, write_long_bag
 
 KILLS = 100 if LONG else 2
@@ -76,18 +76,9 @@ ASKED: tuple[tuple[str, Mapping[str, object]], ...] = (
     ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "max_samples": 5}),
     (
         "find_matches",
-        {
-            "topic": "/odom",
-            "condition_type": "above",
-            "field": "position.x",
-            "value": 8,
-            "by": "day",
-        },
+        clause("/odom", "above", 8, field="position.x", by="day"),
     ),
-    *(
-        ("find_last_match", {"topic": "/chatter", "condition_type": "contains", "value": word})
-        for word in ("word 3", "never")
-    ),
+    *(("find_last_match", clause("/chatter", "contains", word)) for word in ("word 3", "never")),
 )
 
 

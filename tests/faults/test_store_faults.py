@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import NoReturn
+from unittest.mock import patch
 
 import anyio
 import anyio.lowlevel
@@ -225,10 +226,10 @@ def refused(_reader: object, path: Path, **_: object) -> NoReturn:
     raise BagError(str(path), "no columns can be made of it")
 
 
+@patch.object(fill, "undecoded", refused)
 async def test_bags_that_cannot_be_stored_have_the_helper_started_no_second_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(fill, "undecoded", refused)
     write_bags(tmp_path, BACKLOG + 1)
     memory, served_by = served(tmp_path)
     filler = Counted(memory, served_by.filling)

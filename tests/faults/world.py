@@ -1,6 +1,5 @@
 """A memory with everything in it that a server has, and questions that every answer shows in."""
 
-import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.visits import visits
 from ros2_memory.serving.backfill import Backfill
-from tests.support.bags import McapLayout, detections, odom, tf, transform, write_mcap
+from tests.support.bags import McapLayout, detections, odom, set_mtime, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
@@ -47,7 +46,7 @@ def write_bag(bag_dir: Path, number: int) -> Path:
     messages.append(detections(start + NS_PER_S, ["cup", f"thing{number}"]))
     layout = McapLayout(chunk_size=500)
     path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages, layout)
-    os.utime(path, ns=(start, start))
+    set_mtime(path, start)
     return path
 
 

@@ -8,6 +8,7 @@ from mcp.types import TextContent
 
 from ros2_memory.serving.mcp_server import EpisodicServer
 from tests.fuzz.good import AFTER_S, BASE_S, BEFORE_S, LENGTH_S, TOPICS
+from tests.support.memories import clause
 
 Asked = tuple[str, dict[str, Any]]
 
@@ -19,11 +20,11 @@ OF_GOOD: tuple[Asked, ...] = (
     ("get_topic_in_range", {"topic": "/near/odom", "start": 0, "end": 9e9, "max_samples": 20}),
     (
         "find_last_match",
-        {"topic": "/near/seen", "condition_type": "contains", "value": "scissors"},
+        clause("/near/seen", "contains", "scissors"),
     ),
     (
         "find_last_match",
-        {"topic": "/near/*", "condition_type": "equals", "value": "step 3 of a way"},
+        clause("/near/*", "equals", "step 3 of a way"),
     ),
     (
         "get_value_when",

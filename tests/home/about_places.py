@@ -12,9 +12,10 @@ from tests.home.flat import HALL, ROOMS, room_at
 from tests.home.messages import BATTERY, BUMPER, DOCKED
 from tests.home.things import DAY
 from tests.home.truth import Span
+from tests.support.memories import clause
 
-_OFF_DOCK = {"topic": DOCKED.topic, "condition_type": "equals", "value": False}
-_BUMPED = {"topic": BUMPER.topic, "condition_type": "equals", "value": True}
+_OFF_DOCK = clause(DOCKED.topic, "equals", False)
+_BUMPED = clause(BUMPER.topic, "equals", True)
 
 
 def about_places(asked: Asked) -> Iterator[Question]:
@@ -203,14 +204,7 @@ def _each_day(asked: Asked) -> Iterator[Question]:
     yield Question(
         "When did your battery fall below 20 %?",
         "find_matches",
-        {
-            "topic": BATTERY.topic,
-            "condition_type": "below",
-            "value": 0.2,
-            "field": "percentage",
-            "oldest_first": True,
-            "limit": 1,
-        },
+        clause(BATTERY.topic, "below", 0.2, field="percentage", oldest_first=True, limit=1),
         [(near(began, 12.0), "sightings.0.first_seen")],
     )
 

@@ -39,12 +39,10 @@ def test_questions_are_answered_alike_when_bags_are_gone(home: Path, thinned_hom
 
 
 @pytest.mark.skipif(not LONG, reason="every day of a year takes hours: EPISODIC_LONG=1")
-def test_questions_are_answered_alike_for_a_year(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_questions_are_answered_alike_for_a_year(home: Path, tmp_path: Path) -> None:
     world, later = tmp_path / "world", tmp_path / "later"
     shutil.copytree(home, world)
-    write_later_days(SCALE, SCALE.days, YEAR + 1 - SCALE.days, later, monkeypatch)
+    write_later_days(SCALE, SCALE.days, YEAR + 1 - SCALE.days, later)
     year = Year(world / "bags", SCALE.split_s)
     for day in range(SCALE.days, YEAR + 1):
         year.add(later, day)

@@ -1,6 +1,7 @@
 """`ros2-memory prove`: over the messages that an answer rests on, the answer is the same."""
 
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -52,12 +53,12 @@ LIKE_OTHERS = (
 
 @pytest.mark.usefixtures("in_utc")
 @pytest.mark.parametrize("tool", [each for each in TOOLS if LONG or each not in LIKE_OTHERS])
+@patch.object(known, "READING_S", 60.0)
+@patch.object(known, "_ESTIMATING_S", 60.0)
 def test_the_same_question_over_the_proof_has_the_same_answer(
-    home: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, tool: str
+    home: Path, tmp_path: Path, exits: Program, tool: str
 ) -> None:
     # However busy the machine is: bags that there was no time for are in the next answer.
-    monkeypatch.setattr(known, "READING_S", 60.0)
-    monkeypatch.setattr(known, "_ESTIMATING_S", 60.0)
     settings = [f"data.{kind}_file={home / kind}.yaml" for kind in ("places", "labels")]
     question, proof = f"{tool} {QUESTIONS.get(tool, '')}".strip(), tmp_path / "proof"
     proved = exits(0, "prove", question, "-o", proof, "--json", home / "bags", *settings)

@@ -6,8 +6,7 @@ What follows is another life in the same flat: the robot begins it a minute afte
 import shutil
 from dataclasses import replace
 from pathlib import Path
-
-import pytest
+from unittest.mock import patch
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.timebase import NS_PER_S
@@ -32,13 +31,10 @@ _LATER_S = 60
 _BOUNDED = frozenset({"data_time_range", "find_things", "find_matches", "visits"})
 
 
-def write_later_days(
-    first: Scale, begin: int, days: int, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def write_later_days(first: Scale, begin: int, days: int, folder: Path) -> None:
     """Writes the bags of so many days from a day on; the world's first days come before it."""
     later = replace(first, seed=first.seed + 1, days=days)
-    with monkeypatch.context() as patched:
-        patched.setattr(world, "START_S", world.START_S + begin * DAY_S + _LATER_S)
+    with patch.object(world, "START_S", world.START_S + begin * DAY_S + _LATER_S):
         write(later, folder)
 
 

@@ -1,7 +1,6 @@
 """The view of MCP Apps in real Chromium, in a host made from the extension's specification."""
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
@@ -20,6 +19,7 @@ from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.serving.mcp_server import VIEW_URI, EpisodicServer
 from tests.integration.browser import Browser, needs_chromium
 from tests.integration.test_page import ATTACK, painted, write_history
+from tests.support.bags import set_mtime
 from tests.support.clocks import FixedClock
 from tests.support.processes import http_server
 from tests.support.robot_run import T0_S
@@ -39,7 +39,7 @@ def recorded(folder: Path) -> Iterator[None]:
     timeline = MessageSchedule(start, start + ns_from_unix(HEARD_AFTER_S))
     recorder = DemoRecorder(folder / "flat", timeline, split_duration_s=10.0, clock=FixedClock(now))
     for path in folder.rglob("*.mcap"):
-        os.utime(path, ns=(now, now))  # however long it took to write them
+        set_mtime(path, now)  # however long it took to write them
     yield
     recorder.stop()
 

@@ -18,7 +18,7 @@ from mcp import Client
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.columns.store import FILE
-from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.bags import McapLayout, odom, set_mtime, write_db3, write_mcap
 from tests.support.column_worlds import store_file
 from tests.support.housekeepers import recorded_before, state
 from tests.support.processes import until
@@ -60,7 +60,7 @@ def strangers(tmp_path: Path) -> Path:
         for name in ("wal.db3", "wal.db3-wal"):
             shutil.copy(tmp_path / name, folder / "wal" / name)
     for path in folder.rglob("*"):
-        os.utime(path, ns=(T0, T0))
+        set_mtime(path, T0)
     return folder
 
 

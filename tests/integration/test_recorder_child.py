@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -288,10 +289,8 @@ def test_a_bounded_run_kills_what_takes_too_long_with_all_it_started(tmp_path: P
     until(lambda: is_dead(pid))
 
 
-def test_a_bounded_run_needs_no_temporary_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", "/dev/null")
+@patch.object(tempfile, "tempdir", "/dev/null")
+def test_a_bounded_run_needs_no_temporary_file(tmp_path: Path) -> None:
     body = "print('out'); print('error', file=sys.stderr)"
     ran = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
     assert (ran.stdout, ran.stderr) == (b"out\n", b"error\n")

@@ -7,7 +7,6 @@ a drive of one minute, from 08:00:00 UTC on 20 November 2026, in six splits of 1
 """
 
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from tests.support.bags import (
     Msg,
     detections,
     odom,
+    set_mtime,
     text,
     tf,
     tf_of,
@@ -34,7 +34,7 @@ from tests.support.bags import (
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.housekeepers import recorder_at_work
-from tests.support.memories import memory_of
+from tests.support.memories import clause, memory_of
 
 START_S = 1_795_161_600
 RECORDING = "rec_20261120T080000Z"
@@ -64,11 +64,7 @@ CALLS: dict[str, dict[str, object]] = {
     "get_transform_at": {"parent": "map", "child": "camera", "timestamp": START_S + 10},
     "get_transform_seconds_ago": {"parent": "map", "child": "camera", "seconds_ago": 10},
     "list_frames": {},
-    "find_last_match": {
-        "topic": "/vision/*/scene_objects",
-        "condition_type": "contains",
-        "value": "scissors",
-    },
+    "find_last_match": clause("/vision/*/scene_objects", "contains", "scissors"),
     "get_value_when": {
         "value_topic": "/odom",
         "condition_topic": "/vision/scene/scene_objects",
@@ -78,12 +74,7 @@ CALLS: dict[str, dict[str, object]] = {
     },
     "trajectory_summary": {"start": START_S, "end": START_S + 60},
     "recent_trajectory_summary": {"seconds": 30},
-    "find_matches": {
-        "topic": "/vision/scene/scene_objects",
-        "condition_type": "contains",
-        "value": "scissors",
-        "seconds": 64,
-    },
+    "find_matches": clause("/vision/scene/scene_objects", "contains", "scissors", seconds=64),
     "find_things": {"label": "scissors"},
     "compare": {
         "start": START_S + 30,
@@ -133,7 +124,7 @@ def write_history(bag_dir: Path) -> Path:
         path = bag_dir / RECORDING / f"{RECORDING}_{split}.mcap"
         part = [each for each in every if first <= each.log_time < first + 10 * NS_PER_S]
         write_mcap(path, part, McapLayout(latched=LATCHED))
-        os.utime(path, ns=(first + 10 * NS_PER_S,) * 2)
+        set_mtime(path, first + 10 * NS_PER_S)
     return bag_dir
 
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,16 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf_of, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    odom,
+    set_mtime,
+    tf_of,
+    write_mcap,
+)
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 
@@ -110,7 +118,7 @@ def write_robot(robot: SeededRobot, bag_dir: Path) -> Path:
         path = bag_dir / "rec" / f"rec_{number}.mcap"
         part = [each for each in messages if begin <= each.log_time < end]
         write_mcap(path, part, McapLayout(latched=frozenset({"/tf_static"})))
-        os.utime(path, ns=(min(end, first + LENGTH_S * NS_PER_S),) * 2)
+        set_mtime(path, min(end, first + LENGTH_S * NS_PER_S))
     return bag_dir
 
 

@@ -11,6 +11,7 @@ from mcp.types import TextContent
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, boolean, detections, mcap_content, odom, tf, transform
+from tests.support.memories import clause
 
 T0_S = 1_784_023_200
 T0 = T0_S * NS_PER_S
@@ -32,16 +33,12 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ("list_frames", {}, "transforms"),
     (
         "find_last_match",
-        {
-            "topic": "/vision/*/scene_objects",
-            "condition_type": "contains",
-            "value": "scissors",
-        },
+        clause("/vision/*/scene_objects", "contains", "scissors"),
         "timestamp",
     ),
     (
         "find_last_match",
-        {"topic": "/odom", "condition_type": "near_position", "value": '{"x": 0, "y": 0}'},
+        clause("/odom", "near_position", '{"x": 0, "y": 0}'),
         "value",
     ),
     (
@@ -58,7 +55,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ("recent_trajectory_summary", {"seconds": 5}, "distance_m"),
     (
         "find_matches",
-        {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "cup"},
+        clause("/vision/*/scene_objects", "contains", "cup"),
         "sightings",
     ),
     ("find_things", {"label": "cup"}, "things"),
@@ -82,7 +79,7 @@ REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
     ("get_topic_in_range", {"topic": "/odom", "start": 9, "end": 1}, "invalid_arguments", True),
     (
         "find_last_match",
-        {"topic": "/odom", "condition_type": "near_position", "value": "here"},
+        clause("/odom", "near_position", "here"),
         "invalid_arguments",
         True,
     ),

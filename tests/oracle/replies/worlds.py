@@ -3,7 +3,6 @@
 Those of the shared folder are copied, so that times of files and stores lie apart from it.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from mcap.reader import make_reader
 from tests.home import recording as home
 from tests.home.days import Scale
 from tests.oracle import worlds as odd
-from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform
+from tests.support.bags import Msg, boolean, detections, odom, set_mtime, text, tf, transform
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.moving_map import write_moving_map
 from tests.support.noisy_robots import write_noisy_robot
@@ -76,7 +75,7 @@ def _date(folder: Path) -> None:
     """Dates each file to the end of what it holds, where that is known."""
     for path in sorted(folder.rglob("*")):
         at = (_end_of(path) if path.suffix == ".mcap" else None) or WRITTEN_NS
-        os.utime(path, ns=(at, at))
+        set_mtime(path, at)
 
 
 def _end_of(path: Path) -> int | None:
