@@ -382,15 +382,12 @@ def test_a_label_that_two_fields_may_name_is_one_label(remember: Remember) -> No
     assert (rows["cup"]["most_at_once"], rows["box"]["most_at_once"]) == (3, 1)
 
 
-@each_way
-def test_spellings_of_a_label_are_one_row(tmp_path: Path, recalls: bool) -> None:
+def test_spellings_of_a_label_are_one_row(remember: Remember) -> None:
     """A detector that writes "Mug" in some messages had 4 rows of mugs, and thousands of sights."""
     labels = ["mug", "Mug", "mug", "mugs", "mug", "coffee mug"]
     messages = [detections((BEGIN + 4 * nth) * S, [label]) for nth, label in enumerate(labels)]
     messages.append(detections((BEGIN + 24) * S, ["mug", "Mug"]))
-    write_mcap(tmp_path / "a.mcap", messages)
-    limits = QuerySettings(labels={"mug": ["coffee mug"]})
-    memory = memory_of(tmp_path, recalls=recalls, limits=limits)
+    memory = remember(messages, limits=QuerySettings(labels={"mug": ["coffee mug"]}))
     rows = table(asked(memory, "find_matches", **ANY))
     assert [*rows] == ["mug", "all"]
     row = rows["mug"]

@@ -1002,15 +1002,12 @@ def test_a_topic_with_a_dot_in_its_name_is_read_beside_another(tmp_path: Path, n
     assert "drive" in str(row["with"])
 
 
-@each_way
-def test_each_call_of_a_tool_counts_however_soon_it_is_called_again(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_each_call_of_a_tool_counts_however_soon_it_is_called_again(remember: Remember) -> None:
     """A planner calls a tool again where it failed: two calls are no single one."""
     calls = [(0, "drive"), (40, "grasp"), (48, "grasp"), (70, "grasp"), (90, "say")]
     said = [text(BEGIN + at * S, f'{{"tool": "{name}"}}', "/trace") for at, name in calls]
     beats = [boolean(BEGIN + at * S // 10, data=False, topic="/beat") for at in range(1000)]
-    memory = remembered(tmp_path, in_order([*said, *beats]), recalls=recalls)
+    memory = remember(in_order([*said, *beats]))
     sought = {"condition_type": "equals", "field": "data.tool", "value": "grasp"}
     rows = asked(memory, "find_matches", topic="/trace", by="day", **sought)
     assert table(rows)["all"]["count"] == 3

@@ -340,16 +340,15 @@ def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None
     assert "left out, as in elsewhere: yard" in str(found.notes)
 
 
-@each_way
 def test_visits_are_those_of_the_path_where_the_clock_was_set_back(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path, remember: Remember
 ) -> None:
     """It drives to x = 60 in 120 s; the next file begins 100 s earlier, and it comes back."""
     came = along_x(T0 * S, 120, mps=0.5, hz=5)
     back = [odom((T0 + 20) * S + n * S // 5, 60 - n / 10, 0.0) for n in range(600)]
     for nth, driven in enumerate((came, back)):
         write_mcap(tmp_path / "run" / f"run_{nth}.mcap", driven)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = remember()
     for x, seen in ((15, [26, 34]), (40, [76, 84]), (55, [106, 114])):
         where = {"x": x, "y": 0, "radius_m": 2}
         driven_there = asked(memory, "trajectory_summary", start=T0, end=T0 + 200, where=where)
