@@ -176,10 +176,14 @@ class SizeLimit(NamedTuple):
             UnreadableError: it is.
         """
         if size > self.max_bytes:
-            raise UnreadableError(
-                f"{what} is larger than the {self.max_bytes >> 20} MiB allowed; if that is right,"
-                " raise reader.max_chunk_mb"
-            )
+            raise UnreadableError(self.refusal(what))
+
+    def refusal(self, what: str) -> str:
+        """Returns the sentence on something that is larger."""
+        return (
+            f"{what} is larger than the {self.max_bytes >> 20} MiB allowed; if that is right,"
+            " raise reader.max_chunk_mb"
+        )
 
 
 def max_decompressed_bytes(compressed: int) -> int:

@@ -203,6 +203,7 @@ class SqliteBags:
         """Yields the messages of `topics` inside the window, in order.
 
         A `Lost` is yielded first if the indexes of the file are wrong; no message is lost with it.
+        And one in place of each message that is larger than allowed.
         """
         if window.empty:
             return
@@ -218,7 +219,11 @@ class SqliteBags:
             for time, row, number in _ordered_rows(
                 base, wanted, window, declared.readable, newest_first=newest_first, indexed=is_right
             ):
-                stored, *stored_key = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
+                try:
+                    stored, *stored_key = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
+                except sqlite3.DataError:
+                    yield Lost(self._limit.refusal("a message"), time, time)
+                    continue
                 if not isinstance(stored, bytes):
                     raise UnreadableError("damaged: a message without a binary payload")
                 if stored_key != [time, number]:
@@ -472,6 +477,7 @@ def cut_sqlite(
     target: Path,
     stream: IO[bytes],
     leaves_out: Callable[[str, Ns, Ns], bool],
+    max_message_bytes: int,
 ) -> Counter[str]:
     """Copies a file without some messages; returns how many of each topic were left out.
 
@@ -481,6 +487,7 @@ def cut_sqlite(
         stream: into the target, which is empty.
         leaves_out: whether a message is left out, by topic, log time and publish time; the format
             has log times only, which are passed twice.
+        max_message_bytes: a source with a larger message is refused.
 
     Raises:
         UnreadableError: the source has a journal or is no plain bag, or the target is not right.
@@ -491,7 +498,7 @@ def cut_sqlite(
         shutil.copyfileobj(original, stream)
     stream.flush()
     with closing(sqlite3.connect(target, isolation_level=None)) as base:
-        guard(base, MAX_CHUNK_MB << 20, _MORE_WORK * target.stat().st_size)
+        guard(base, max_message_bytes, _MORE_WORK * target.stat().st_size)
         require_plain_tables(base)
         if base.execute(_TRIGGERS).fetchall():
             raise UnreadableError("not a rosbag2 file: it has triggers")

@@ -170,6 +170,20 @@ def test_nothing_of_it_is_left_anywhere(
     assert not [*bag_dir.rglob("*.repair"), *bag_dir.rglob("*.tmp")]
 
 
+@pytest.mark.parametrize("write", [write_mcap, write_db3])
+def test_beside_a_message_that_is_as_large_as_is_allowed(
+    bag_dir: Path, forget: Forget, write: Callable[[Path, list[Msg]], Path]
+) -> None:
+    cloud = text(T0 + S, "x" * (65 << 20), "/cloud")
+    suffix = ".mcap" if write is write_mcap else ".db3"
+    path = left(write(bag_dir / "big" / f"big_0{suffix}", [cloud, *messages(0)]))
+    own_all(bag_dir)
+    given = "storage=rosbag2 reader.max_chunk_mb=128"
+    assert "forgotten" not in forget(1, 0, 100, f"{OF_CAMERA} storage=rosbag2").out
+    forget(0, 0, 100, f"{OF_CAMERA} {given}")
+    assert SAID.encode() not in path.read_bytes()
+
+
 def test_a_moment_that_is_kept_meanwhile_follows(
     tmp_path: Path, bag_dir: Path, forget: Forget, monkeypatch: pytest.MonkeyPatch
 ) -> None:

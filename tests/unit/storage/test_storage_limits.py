@@ -21,6 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage import errors
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, errors_as_items
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
@@ -46,7 +47,8 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
-from tests.support.bags import Msg, text, write_db3
+from tests.support.bags import text, write_db3, write_mcap
+from tests.support.reader_cases import read_through
 
 MB = 1 << 20
 TOO_LONG = "a" * MAX_NAMES_CHARS
@@ -150,9 +152,27 @@ def test_a_chunk_larger_than_allowed_is_refused_before_it_is_in_memory(tmp_path:
         assert batch.log_times.tolist() == [time]
 
 
-def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
-    tmp_path: Path,
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_a_message_larger_than_allowed_costs_no_other_of_its_db3(
+    tmp_path: Path, *, newest_first: bool
 ) -> None:
+    path = tmp_path / "run_0.db3"
+    write_db3(path, [text(time, "x" * 2 * MB if time == 6 else "x") for time in (5, 6, 7)])
+    reader = Rosbag2Reader(max_chunk_mb=1)
+    assert reader.summarize(path).count == 3
+    records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+    found, [lost] = read_through(records)
+    assert [record.log_time for record in found] == ([7, 5] if newest_first else [5, 7])
+    assert lost.lost == (6, 6)
+    assert "larger than the 1 MiB allowed" in lost.reason
+    batches, [lost] = read_through(reader.batches(path, ["/chatter"], EVERYTHING))
+    assert [batch.log_times.tolist() for batch in batches] == [[5], [7]]
+
+
+def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(errors, "_ALWAYS_ALLOWED", 32 * MB)
     whole = string_chunk()
     summary = McapReader().summarize(bag(tmp_path, whole, *[bomb(30 * MB)] * 5, whole))
     assert summary.count == 1
@@ -277,7 +297,10 @@ def test_what_is_cached_never_passes_the_bound(puts: list[tuple[int, int]]) -> N
         assert sum(cache.get(each) or 0 for each in range(6)) <= 20_000
 
 
-def test_a_file_that_unpacks_to_far_more_than_its_size_is_not_unpacked(tmp_path: Path) -> None:
+def test_a_file_that_unpacks_to_far_more_than_its_size_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(errors, "_ALWAYS_ALLOWED", 32 * MB)
     path = tmp_path / "bag.mcap.zstd"
     start = zstandard.compress(MAGIC + header().data)
     path.write_bytes(start + rle_frame(max_decompressed_bytes(MB)))
@@ -352,15 +375,6 @@ def test_a_database_that_is_not_what_it_seems_is_refused_before_it_is_read(
         base.executescript(statements)
     with little_memory(4 * MB), pytest.raises(BagError, match=said):
         Rosbag2Reader().summarize(path)
-
-
-def test_a_message_larger_than_allowed_is_named(tmp_path: Path) -> None:
-    messages = [text(1, "x"), Msg("/chatter", "std_msgs/msg/String", 2, bytes(2 * MB))]
-    path = write_db3(tmp_path / "bag.db3", messages)
-    reader = Rosbag2Reader(max_chunk_mb=1)
-    read = reader.records(path, ["/chatter"], EVERYTHING)
-    with pytest.raises(BagError, match="too big"):
-        list(read)
 
 
 def test_what_works_longer_than_the_size_explains_is_interrupted() -> None:

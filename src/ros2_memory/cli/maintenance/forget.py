@@ -150,13 +150,12 @@ class _Forget:
         recordings = OwnRecordings(self._bag_dir)
         self._own = recordings if settings.retention.foreign == "keep" else None
         static_topics = settings.data.tf_static_topics
-        self._carrier = Carrier(
-            self._bag_dir, memory.reader, McapWriter(), static_topics, recordings
-        )
+        writer = McapWriter(settings.reader.max_chunk_mb)
+        self._carrier = Carrier(self._bag_dir, memory.reader, writer, static_topics, recordings)
         self._eraser = Eraser(
             self._bag_dir,
             self._reader,
-            McapWriter(),
+            writer,
             self._own,
             written=self._written,
             recorder=self._recorder,

@@ -118,7 +118,7 @@ class McapWriter(BagWriter):
         with _new_file(target) as stream:
             if source.suffix.lower() == SQLITE:
                 with reading(source):
-                    return cut_sqlite(source, target, stream, leaves_out)
+                    return cut_sqlite(source, target, stream, leaves_out, self._limit.max_bytes)
             with reading(source), OpenFile(source) as file:
                 if not is_finished(file):
                     raise UnreadableError("its writer did not finish it")
