@@ -570,7 +570,7 @@ class _Messages:
         logged, places, published = times[:, order]
         payloads = None
         if self.payloads is not None:
-            payloads = [self.payloads[position] for position in order.tolist()]
+            payloads = [*map(self.payloads.__getitem__, order.tolist())]
         needed_places = places if np.isin(logged, tied).any() else None
         packed = packed_messages(logged, published, payloads, needed_places)
         most = max(_MOST_OF_MESSAGE * len(logged), _LEAST_OF_CHANNEL)

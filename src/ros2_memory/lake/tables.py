@@ -293,7 +293,7 @@ def packed_messages(
     if places is not None:
         parts.append(byte_planes(np.diff(places, prepend=np.int64(0)), 8))
     if payloads is not None:
-        sizes = np.array([len(payload) for payload in payloads], np.int64)
+        sizes = np.fromiter(map(len, payloads), np.int64, len(payloads))
         joined = b"".join(payloads)
         if len(sizes) and (sizes == sizes[0]).all():
             rows = np.frombuffer(joined, np.uint8).reshape(len(sizes), -1)
