@@ -25,7 +25,7 @@ from ros2_memory.core.arrays import (
     sorted_codes,
     stable_order,
 )
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, Span
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, Span
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Sequence
@@ -44,7 +44,7 @@ THINNED_NS: Final = 7 * NS_PER_S
 FLICKER_NS: Final = 3 * NS_PER_S
 """An object that is missed for less time has not left."""
 USUAL_PERIODS: Final = 3
-_FEWEST_ONCE: Final = 3
+_FEWEST: Final = 3
 SHORT_NS: Final = NS_PER_S
 
 ROW: Final = np.dtype(
@@ -176,25 +176,12 @@ class IntervalTable(NamedTuple):
         rows["label"], labels = sorted_codes(rows["label"], [*map(label_of, self.labels)])
         return united_tables([IntervalTable(labels, rows.tobytes())])
 
-    def seen_once(self, within: Ns) -> IntervalTable:
-        """Returns the intervals of the labels that were seen within one short time alone.
-
-        They have `_FEWEST_ONCE` messages or more: detectors are wrong now and then.
-        """
-        rows = self._array
-        labels = rows["label"]
-        first, last = np.full(len(self.labels), MAX_NS), np.full(len(self.labels), MIN_NS)
-        np.minimum.at(first, labels, rows["first"])
-        np.maximum.at(last, labels, rows["last"])
-        is_once = first + within >= last
-        return self._select(is_once[labels] & (rows["count"] >= _FEWEST_ONCE))
-
     def of_each_label(self) -> list[tuple[VisibleInterval, int, Ns]]:
         """Returns for each label the time from first to last, how many intervals, and their length.
 
-        Intervals of fewer than `_FEWEST_ONCE` messages do not count.
+        Intervals of fewer than `_FEWEST` messages do not count: detectors are wrong now and then.
         """
-        steady = self._select(self._array["count"] >= _FEWEST_ONCE)
+        steady = self._select(self._array["count"] >= _FEWEST)
         best = np.full(len(self.labels), _NO_SCORE)
         np.maximum.at(best, steady._array["label"], steady._array["best"])
         return [
@@ -203,8 +190,8 @@ class IntervalTable(NamedTuple):
                 first.size,
                 int((last - first).sum()),
             )
-            for (label, (first, last)), score in zip(
-                steady.spans().items(), best.tolist(), strict=True
+            for score, (label, (first, last)) in zip(
+                best.tolist(), steady.spans().items(), strict=True
             )
             if first.size
         ]

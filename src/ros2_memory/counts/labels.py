@@ -40,7 +40,7 @@ from ros2_memory.results import Bins
 from ros2_memory.things.labels import Labels
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.arrays import Flags
@@ -66,14 +66,14 @@ class SeenLabels(NamedTuple):
 
     Attributes:
         visible: the intervals in which each label was in view, by its key.
-        names: for each key, the label to show.
+        name_of: returns the label to show for a key.
         most_at_once: for each key, the most detections of it in one message.
         most_of_all: the most detections of all these labels in one message.
         since: log time after which everything was read, if time ran out; else None.
     """
 
     visible: IntervalTable
-    names: Mapping[str, str]
+    name_of: Callable[[str], str]
     most_at_once: Counter[str]
     most_of_all: int
     since: Ns | None
@@ -196,7 +196,7 @@ def _label_rows(seen: SeenLabels, elapsed: Elapsed) -> list[tuple[str, _LabelRow
     for interval in seen.visible.intervals():
         intervals_of[interval.label].append(interval)
     rows = [
-        (named(seen.names[key]), _row(intervals, elapsed, seen.most_at_once[key]))
+        (named(seen.name_of(key)), _row(intervals, elapsed, seen.most_at_once[key]))
         for key, intervals in intervals_of.items()
     ]
     return sorted(rows, key=lambda named_row: (-named_row[1].occurrences, named_row[0]))
@@ -253,7 +253,7 @@ def read_labels(
         spellings += block.spellings
     return SeenLabels(
         united_tables([joined_visible(newest[::-1]) for newest in parts.values()]),
-        labels.most_frequent(spellings),
+        labels.one_spelling(spellings),
         most_at_once,
         max((block.most_of_all for block in seen_blocks), default=0),
         since,

@@ -510,11 +510,13 @@ def _things_in_view(
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
-    label_of = _shown_labels(view, [events.visible for events in events_of_topics.values()])
+    every = united_tables([events.visible for events in events_of_topics.values()])
+    label_of = Labels(view.limits.labels).one_spelling(every.messages())
     for topic_events in events_of_topics.values():
-        every = topic_events.visible.relabelled(label_of)
-        visible = every.scoring(min_score) if min_score else every
-        below += every.size - visible.size
+        visible = topic_events.visible.relabelled(label_of)
+        below += visible.size
+        visible = visible.scoring(min_score) if min_score else visible
+        below -= visible.size
         tables.append(visible)
         throughout.update(visible.throughout(start, end))
         for label in visible.at_end(topic_events.last, known_to):
@@ -530,29 +532,19 @@ def _things_in_view(
         throughout = set()
         things = things.during([stay.span for stay in region_stays.stays])
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
-    rare = IntervalTable()
-    if region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS:
-        rare = things.seen_once(NS_PER_HOUR).longest_of_each()
-    if things.size <= most:
-        events = [_sight_event(interval, last_seen) for interval in things.longest(most)]
+    is_long = region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS
+    if is_long or things.size > most:
+        events = [_sight_event(last_seen, *of_label) for of_label in things.of_each_label()]
     else:
-        events = [_sight_event(one, last_seen, *of) for one, *of in things.of_each_label()]
-    rare_labels = [interval.label for interval in rare.longest(_MOST_RARE)]
+        events = [_sight_event(last_seen, interval) for interval in things.longest(most)]
+    once = [event for event in events if is_long and event.length <= NS_PER_HOUR]
     return _ThingsInView(
         events,
-        [event for event in events if event.label in rare_labels],
+        nsmallest(_MOST_RARE, once, key=lambda event: -event.length),
         things.size,
         throughout,
-        [_sight_event(interval, last_seen) for interval in longest_of_each],
+        [_sight_event(last_seen, interval) for interval in longest_of_each],
     )
-
-
-def _shown_labels(view: View, tables: Sequence[IntervalTable]) -> Callable[[str], str]:
-    """Returns what maps each spelling of a label to the most frequent one."""
-    counts = sum((table.messages() for table in tables), Counter[str]())
-    labels = Labels(view.limits.labels)
-    names = labels.most_frequent(counts)
-    return lambda label: names[labels.key(label)]
 
 
 def _recorded_for(view: View, window: TimeWindow) -> Ns:
@@ -562,7 +554,7 @@ def _recorded_for(view: View, window: TimeWindow) -> Ns:
 
 
 def _sight_event(
-    interval: VisibleInterval, last_seen: Mapping[str, Ns], times: int = 1, length: Ns = 0
+    last_seen: Mapping[str, Ns], interval: VisibleInterval, times: int = 1, length: Ns = 0
 ) -> Event:
     """Returns a sight of a thing, or several as one event, which last so long (ns) in all.
 
@@ -774,23 +766,19 @@ def _most_important(
     A note says how many are left out; one alone is not.
     """
     alike = counts + Counter(map(_boolean_of, events))
-    lasted = {event: (event.end or event.start) - event.start for event in events}
     held = Counter[str]()
     for event in events:
-        held[event.text] += lasted[event] if event.kind == "flip" else 0
+        held[event.text] += event.length if event.kind == "flip" else 0
 
     def rank(event: Event) -> tuple[int, int, int, Ns, Ns]:
         kind, often = _KINDS.index(event.kind), alike[_boolean_of(event) or event.kind]
         often = min(often, _MOST_RARE) if event in rare else often
-        return min(kind, _OF_ANY_DAY), often, kind, held[event.text], -lasted[event]
+        return min(kind, _OF_ANY_DAY), often, kind, held[event.text], -event.length
 
     if counts.total() == len(events) == most + 1:
         most += 1
     shown = sorted(events, key=rank)[:most]
-    left_out = Counter(counts)
-    for event in shown:
-        left_out[event.kind] -= event.times
-    left_out = +left_out
+    left_out = counts - sum((Counter({event.kind: event.times}) for event in shown), Counter())
     if left_out:
         named = [
             counted(left_out[kind], "sight of a thing" if kind == "thing" else kind, several)

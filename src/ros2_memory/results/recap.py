@@ -264,6 +264,11 @@ class Event:
     label: str = ""
     times: int = 1
 
+    @property
+    def length(self) -> Ns:
+        """How long it took (ns), also by a clock that skipped a part."""
+        return (self.end or self.start) - self.start
+
 
 @result(
     TIME("start"),

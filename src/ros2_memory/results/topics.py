@@ -114,8 +114,8 @@ class Extremes:
 
 
 def _times(answer: TopicRange) -> list[Ns]:
-    ends = [sample.time for sample in (*answer.samples[:1], *answer.samples[-1:])]
-    return ends + [at for one in answer.extremes for at in (one.least_at, one.most_at)]
+    extremes = [at for one in answer.extremes for at in (one.least_at, one.most_at)]
+    return [sample.time for sample in answer.samples] + extremes
 
 
 def _first_time(answer: TopicRange) -> Ns | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.text import MAX_LABEL_CHARS, caseless, shortened
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 _SPACING: Final = re.compile(r"[\s_\-]+")
 _IRREGULAR: Final = {
@@ -185,11 +185,11 @@ class Labels:
         plain_key = _key_of(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
-    def most_frequent(self, counts: Mapping[str, int]) -> dict[str, str]:
-        """Returns for each key the label that is written most often; `counts` has each label's."""
-        return {
-            self.key(label): label for _, label in sorted((n, one) for one, n in counts.items())
-        }
+    def one_spelling(self, counts: Mapping[str, int]) -> Callable[[str], str]:
+        """Returns what maps a label, or its key, to the spelling that `counts` has most often."""
+        by_count = sorted(counts, key=lambda label: (counts[label], label))
+        names = {self.key(label): label for label in by_count}
+        return lambda label: names.get(self.key(label), label)
 
     def are_apart(self, one: str, other: str) -> bool:
         """Returns whether the owner declared two keys as different things."""
