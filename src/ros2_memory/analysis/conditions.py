@@ -378,13 +378,15 @@ def texts_beside(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     """
     holder, _, key = (condition.field or "").rpartition(".")
     on_key = replace(condition, field=key or None)
-    texts: dict[str, None] = {}
-    for found in at_field(value, holder) if holder else [value]:
-        for one in found if isinstance(found, list) else [found]:
-            if isinstance(one, dict) and on_key.matches(one):
-                said = (one.get(name) for name in ("name", "msg", "message"))
-                texts.update(dict.fromkeys(text for text in said if text and isinstance(text, str)))
-    return tuple(texts)
+    found = at_field(value, holder) if holder else [value]
+    objects = chain.from_iterable(each if isinstance(each, list) else [each] for each in found)
+    said = (
+        one.get(name)
+        for one in objects
+        if isinstance(one, dict) and on_key.matches(one)
+        for name in ("name", "msg", "message")
+    )
+    return tuple(dict.fromkeys(text for text in said if text and isinstance(text, str)))
 
 
 def parse_condition(

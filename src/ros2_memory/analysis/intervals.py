@@ -12,7 +12,6 @@ the time. It was if its messages follow each other at the detector's usual rate:
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -135,7 +134,9 @@ class IntervalTable(NamedTuple):
     def intervals(self) -> tuple[VisibleInterval, ...]:
         """Returns all intervals as objects."""
         return tuple(
-            VisibleInterval(self.labels[label], first, last, _shown_score(best))
+            VisibleInterval(
+                self.labels[label], first, last, None if best == _NO_SCORE else best / _SCORES
+            )
             for first, last, label, *_, best in self._array.tolist()
         )
 
@@ -165,10 +166,10 @@ class IntervalTable(NamedTuple):
         _, longest = np.unique(self._array["label"][by_length], return_index=True)
         return self._select(np.sort(by_length[longest]))
 
-    def messages(self) -> Counter[str]:
+    def messages(self) -> dict[str, float]:
         """Returns how many messages have each label."""
         counts = np.bincount(self._array["label"], self._array["count"], len(self.labels))
-        return Counter(dict(zip(self.labels, counts.astype(np.int64).tolist(), strict=True)))
+        return dict(zip(self.labels, counts.tolist(), strict=True))
 
     def relabelled(self, label_of: Callable[[str], str]) -> IntervalTable:
         """Returns the intervals with other labels; those that overlap then are one."""
@@ -179,20 +180,17 @@ class IntervalTable(NamedTuple):
     def of_each_label(self) -> list[tuple[VisibleInterval, int, Ns]]:
         """Returns for each label the time from first to last, how many intervals, and their length.
 
-        Intervals of fewer than `_FEWEST` messages do not count: detectors are wrong now and then.
+        The time has no score. Intervals of fewer than `_FEWEST` messages do not count: detectors
+        are wrong now and then.
         """
-        steady = self._select(self._array["count"] >= _FEWEST)
-        best = np.full(len(self.labels), _NO_SCORE)
-        np.maximum.at(best, steady._array["label"], steady._array["best"])
+        spans = self._select(self._array["count"] >= _FEWEST).spans()
         return [
             (
-                VisibleInterval(label, int(first[0]), int(last.max()), _shown_score(score)),
+                VisibleInterval(label, int(first[0]), int(last.max()), None),
                 first.size,
                 int((last - first).sum()),
             )
-            for score, (label, (first, last)) in zip(
-                best.tolist(), steady.spans().items(), strict=True
-            )
+            for label, (first, last) in spans.items()
             if first.size
         ]
 
@@ -285,10 +283,6 @@ def _stored_scores(scores: NDArray[np.float64]) -> Ints:
     with np.errstate(invalid="ignore"):
         stored = np.rint(np.clip(scores, -most / _SCORES, most / _SCORES) * _SCORES)
     return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
-
-
-def _shown_score(stored: int) -> float | None:
-    return None if stored == _NO_SCORE else stored / _SCORES
 
 
 def united_tables(

@@ -185,7 +185,7 @@ class Labels:
         plain_key = _key_of(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
-    def one_spelling(self, counts: Mapping[str, int]) -> Callable[[str], str]:
+    def one_spelling(self, counts: Mapping[str, float]) -> Callable[[str], str]:
         """Returns what maps a label, or its key, to the spelling that `counts` has most often."""
         by_count = sorted(counts, key=lambda label: (counts[label], label))
         names = {self.key(label): label for label in by_count}
