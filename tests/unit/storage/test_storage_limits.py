@@ -47,7 +47,7 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
-from tests.support.bags import text, write_db3, write_mcap
+from tests.support.bags import text, write_db3
 from tests.support.reader_cases import read_through
 
 MB = 1 << 20
