@@ -533,11 +533,14 @@ def _things_in_view(
         things = things.during([stay.span for stay in region_stays.stays])
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
     is_long = region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS
-    if is_long or things.size > most:
-        events = [_sight_event(last_seen, *of_label) for of_label in things.of_each_label()]
+    of_labels = things.of_each_label()
+    # A page that draws more events than that shows when each thing was in view.
+    if most == MOST_EVENTS and (is_long or things.size > most):
+        events = [_sight_event(last_seen, *of_label) for of_label in of_labels]
     else:
         events = [_sight_event(last_seen, interval) for interval in things.longest(most)]
-    once = [event for event in events if is_long and event.length <= NS_PER_HOUR]
+    brief = {one.label for one, *_ in of_labels if one.last - one.first <= NS_PER_HOUR}
+    once = [event for event in events if is_long and event.label in brief]
     return _ThingsInView(
         events,
         nsmallest(_MOST_RARE, once, key=lambda event: -event.length),
