@@ -91,7 +91,7 @@ class PlotWindow(NamedTuple):
         """Returns the recap of the window."""
         start_s, end_s = self.span
         asked = TimeRange(start_s, max(end_s, start_s + _SHORTEST_S))
-        return recap(self.view.memory, Call(), asked)
+        return recap(self.view.memory, Call(), asked, each_sight=True)
 
 
 @dataclass(frozen=True, kw_only=True)

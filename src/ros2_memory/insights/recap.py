@@ -154,13 +154,15 @@ def recap(
     most_events: int = MOST_EVENTS,
     with_changes: bool = True,
     with_sights: bool = True,
+    each_sight: bool = False,
 ) -> Recap:
     """Returns what happened in a window; with `where` only while the robot was in that region.
 
     Places are in the map if transforms lead there at their time, or in `frame_id`. Things in view
     count with a best score of `min_score` or more, or without scores. If there are more than
     `most_events`, the most important ones are returned. With `with_changes` they have what changed
-    before them. Without `with_sights` things in view are no events, but counted all the same.
+    before them. Without `with_sights` things in view are no events, but counted all the same. Where
+    there are many sights, each label has one event, unless `each_sight` is to be drawn.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
@@ -188,6 +190,7 @@ def recap(
         places=places,
         min_score=memory.limits.min_score if min_score is None else min_score,
         most=most_events,
+        each_sight=each_sight,
     )
     note_unread(view, window)
     note_edges(view, window)
@@ -246,10 +249,19 @@ def _what_happened(
     places: RobotPlaces | None,
     min_score: float,
     most: int,
+    each_sight: bool,
 ) -> _Happened:
     """Returns what happened in a window, with at most `most` stops and sightings."""
     start, _ = window.asked()
-    things = _things_in_view(view, window, topics, region_stays, min_score=min_score, most=most)
+    things = _things_in_view(
+        view,
+        window,
+        topics,
+        region_stays,
+        min_score=min_score,
+        most=most,
+        each_sight=each_sight,
+    )
     stops = drive.stops
     if region_stays is not None:
         stops = [stop for stop in stops if region_stays.overlaps(*stop.span)]
@@ -497,11 +509,12 @@ def _things_in_view(
     *,
     min_score: float,
     most: int,
+    each_sight: bool,
 ) -> _ThingsInView:
     """Returns the things that were seen, with events of at most `most`, and of as many labels.
 
-    Of more sights than that each label has one event. In a region nothing counts as seen
-    throughout. A note says how many scores are too low.
+    Of more sights than that, or in a long record, each label has one event, unless `each_sight`. In
+    a region nothing counts as seen throughout. A note says how many scores are too low.
     """
     start, end = window.asked()
     newest = view.snapshot.latest
@@ -534,11 +547,14 @@ def _things_in_view(
     longest_of_each = things.longest_of_each().most_lasting(most).intervals()
     is_long = region_stays is None and _recorded_for(view, window) >= _LONG_RECORD_NS
     of_labels = things.of_each_label()
-    # A page that draws more events than that shows when each thing was in view.
-    if most == MOST_EVENTS and (is_long or things.size > most):
-        events = [_sight_event(last_seen, *of_label) for of_label in of_labels]
-    else:
+    if each_sight or not (is_long or things.size > most):
         events = [_sight_event(last_seen, interval) for interval in things.longest(most)]
+    else:
+        events = [_sight_event(last_seen, *of_label) for of_label in of_labels]
+        steady = {one.label for one, *_ in of_labels}
+        events += [
+            _sight_event(last_seen, one) for one in longest_of_each if one.label not in steady
+        ]
     brief = {one.label for one, *_ in of_labels if one.last - one.first <= NS_PER_HOUR}
     once = [event for event in events if is_long and event.label in brief]
     return _ThingsInView(

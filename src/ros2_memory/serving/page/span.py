@@ -448,7 +448,12 @@ def _place_outline(place: Place) -> JsonObject:
 def _events(memory: Memory, call: Call, window: TimeWindow) -> Part:
     """Returns what happened in a window, and its totals."""
     summary = recap(
-        memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
+        memory,
+        call,
+        TimeRange.over(window),
+        most_events=MOST_EVENTS,
+        with_changes=False,
+        each_sight=True,
     )
     shown = {**SUMMARY.render(summary), **_ALL_EVENTS.render(summary)}
     return Part({**shown, "events_since": _start_s(window)}, summary.notes)
