@@ -270,23 +270,22 @@ class Database:
             self.write(lambda _: None)
 
     def release_pages(self) -> None:
-        """Returns unused pages to the disk if there are many.
+        """Returns unused pages to the disk, but for a few."""
+        while self._release_some_pages():
+            # Else this thread would take the lock again before those that wait for it.
+            time.sleep(_PAUSE_S)
 
-        A few at a time, so that nobody waits for long. The file must have been created with
-        `auto_vacuum = INCREMENTAL`.
-        """
-        while True:
-            with self._lock:
-                opened = self._open_if_needed()
-                if opened is None or opened.path is None or self._close_if_lost(opened):
-                    return
-                with suppress(sqlite3.Error):
-                    [unused] = opened.connection.execute("PRAGMA freelist_count").fetchone()
-                    if unused > _FEW_PAGES:
-                        # A script: a statement alone would free one page, whatever it asks for.
-                        opened.connection.executescript(f"PRAGMA incremental_vacuum({_FEW_PAGES})")
-                        continue
-            return
+    def _release_some_pages(self) -> bool:
+        """Returns some unused pages to the disk; returns False if there are few."""
+        with self._lock, suppress(sqlite3.Error):
+            opened = self._open_if_needed()
+            if opened is not None and opened.path is not None and not self._close_if_lost(opened):
+                unused = _unused_pages(opened.connection)
+                if unused > _FEW_PAGES:
+                    # A script: a statement alone would free one page, whatever it asks for.
+                    opened.connection.executescript(f"PRAGMA incremental_vacuum({_FEW_PAGES})")
+                    return _unused_pages(opened.connection) < unused
+        return False
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Closes a file that was deleted, replaced or damaged; the next read or write reopens it.
@@ -536,6 +535,10 @@ def is_transient(error: Exception) -> bool:
     is_operational = isinstance(error, sqlite3.OperationalError)
     is_of_content = sqlite_code(error) in {0, sqlite3.SQLITE_ERROR}
     return isinstance(error, MemoryError) or (is_operational and not is_of_content)
+
+
+def _unused_pages(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("PRAGMA freelist_count").fetchone()[0])
 
 
 def is_busy(error: Exception) -> bool:

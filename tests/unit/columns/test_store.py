@@ -7,6 +7,7 @@ import struct
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from ros2_memory.columns import forget as forgetting
-from ros2_memory.columns.database import TABLES
+from ros2_memory.columns.database import TABLES, Database
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.pack import FORMAT, decompress
@@ -310,6 +311,29 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     assert check_all(world) == 14 * 121
     world.fill()
     assert len(world.stored()) == 14
+
+
+def test_others_may_read_between_two_steps_in_which_pages_go_back_to_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = Database([tmp_path / "columns.sqlite"])
+    unused: list[int] = []
+
+    def fill_and_empty(connection: sqlite3.Connection) -> None:
+        connection.execute("INSERT INTO part_column VALUES (1, 'x', NULL, zeroblob(4000000))")
+        connection.execute("DELETE FROM part_column")
+
+    def read(_: float = 0) -> None:
+        pragma = "PRAGMA freelist_count"
+        unused.append(database.read(lambda opened: opened.execute(pragma).fetchone()[0], -1))
+
+    assert database.write(fill_and_empty)
+    read()
+    monkeypatch.setattr("ros2_memory.columns.database.time.sleep", read)
+    database.release_pages()
+    assert 0 < unused[-1] <= 256
+    assert [before - after for before, after in pairwise(unused)] == [256] * 3
+    database.close()
 
 
 def test_what_another_program_reads_all_the_time_is_named(
