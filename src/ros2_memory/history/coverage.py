@@ -316,9 +316,10 @@ def _describe_open_end(
         yield f"after {unix_text(latest)} messages may be missing, because {', and '.join(causes)}"
 
 
-def span_text(start: Ns, end: Ns) -> str:
-    """Returns a span of log time, and how long it is, for a sentence."""
-    return f"{unix_text(start)} to {unix_text(end)} ({seconds(end - start)})"
+def span_text(start: Ns, end: Ns, length: Ns | None = None) -> str:
+    """Returns a span of log time, and how long it or what is in it lasts, for a sentence."""
+    lasting = seconds(end - start if length is None else length)
+    return f"{unix_text(start)} to {unix_text(end)} ({lasting})"
 
 
 def _unrecorded_parts(snapshot: Snapshot, gap: Span, gone: Sequence[Span]) -> Sequence[Span]:

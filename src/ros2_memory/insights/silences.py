@@ -127,9 +127,9 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
     silences = [silence for silence in silences_in(view, window) if silence.topic in topics]
     if not silences:
         return ()
-    longest = sorted(silences, key=lambda silence: silence.start - silence.end)[:MAX_NAMED]
+    longest = sorted(silences, key=lambda silence: -silence.length)[:MAX_NAMED]
     names = [
-        f"{silence.topic} {span_text(silence.start, silence.end)}"
+        f"{silence.topic} {span_text(silence.start, silence.end, silence.length)}"
         for silence in sorted(longest, key=lambda silence: silence.start)
     ]
     return (f"silent while the robot was on, so not searched: {listed(names, len(silences))}",)

@@ -1,6 +1,7 @@
 """What a memory says of itself: losses, faults, and detectors that were blind for a while."""
 
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +38,7 @@ from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import Remember, asked, each_way, memory_of, noted, remembered
+from tests.support.memories import Remember, asked, clause, each_way, memory_of, noted, remembered
 
 S = 10**9
 T0 = 1_784_000_000
@@ -444,6 +445,28 @@ def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_p
     other = {"with_start": T0 + morning + 1200, "with_end": T0 + morning + 2399}
     reply = asked(memory_of(tmp_path), "compare", **first, **other)
     assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}
+
+
+def test_never_names_the_longest_silences_by_how_long_the_robot_was_on(tmp_path: Path) -> None:
+    """The last of four goes on over a night: the robot was on for 400 s of it."""
+    morning = 45_000
+    silent = [(1200, 1800), (3000, 3900), (5400, 6600), (10_000, morning + 200)]
+    for begin in (*range(0, 10_200, 600), *range(morning, morning + 20_400, 600)):
+        messages = [
+            boolean((T0 + at) * S + nth, data=True, topic=name)
+            for at in range(begin, begin + 600, 5)
+            for nth, name in enumerate(["/t0", "/t1", "/t2", "/t3", "/bumper"])
+            if name != "/bumper" or not any(first <= at < last for first, last in silent)
+        ]
+        name = "day" if begin < morning else "morning"
+        write_mcap(tmp_path / name / f"{name}_{begin}.mcap", messages)
+    memory = memory_of(tmp_path)
+    lengths = []
+    for after in (T0, T0 + 2000):
+        reply = asked(memory, "find_matches", **clause("/bumper", "equals", False), start=after)
+        [note] = noted(reply, "silent while the robot was on")
+        lengths.append(re.findall(r"\((.+?) s\)", note))
+    assert lengths == [["605", "905", "1205"], ["905", "1205", "400"]]
 
 
 def test_silences_are_in_order_after_what_was_deleted_inside_of_one(
