@@ -822,7 +822,8 @@ def _note_bags(view: View) -> None:
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
     found = memory.scanner.damaged_parts(snapshot.bags)
     odd += [(bag, fault) for bag, fault in found if fault not in bag.summary.notes]
-    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
+    in_order = sorted(odd, key=lambda remark: remark[0].start)
+    view.notes.add(*by_remark(in_order, _MAX_ODD_BAGS))
     thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
     if thinned and (since is None or thinned[0].start < since):
         before = "" if since is None else f" before {unix_text(since)}"

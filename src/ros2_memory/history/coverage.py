@@ -550,7 +550,7 @@ def _nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
 
 
 def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
-    """Yields a sentence for each remark, with the bags that share it.
+    """Yields a sentence for each remark on bags in order of time, with the bags that share it.
 
     At most `most` remarks are shown, those of the newest bags.
     """

@@ -2,6 +2,7 @@
 
 import json
 import re
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from mcap.opcode import Opcode
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -37,7 +39,7 @@ from tests.support.bags import (
 from tests.support.clocks import SettableClock
 from tests.support.heartbeats import beat
 from tests.support.log_lines import with_checks
-from tests.support.mcap_surgery import spoil_chunk
+from tests.support.mcap_surgery import edit_summary, spoil_chunk
 from tests.support.memories import Remember, asked, clause, each_way, memory_of, noted, remembered
 
 S = 10**9
@@ -321,6 +323,22 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     write_mcap(bag, driven)
     memory.index.refresh()
     assert shown(memory)["doubts"] == SOUND
+
+
+def test_of_many_odd_bags_those_of_the_newest_are_named_whatever_is_odd(tmp_path: Path) -> None:
+    for number in range(7):
+        driven = along_x(BEGIN + 10 * number * S, 10, hz=10)
+        bag = write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", driven, McapLayout(3000))
+        if number < 2:
+            spoil_chunk(bag, 3)
+            continue
+        wrong = struct.pack("<Q", 1000 + number)
+        edit_summary(bag, Opcode.STATISTICS, lambda body, to=wrong: body.__setitem__(slice(8), to))
+    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 100 * S))
+    asked(memory, "trajectory_summary", start=T0, end=T0 + 20)
+    *notes, more = asked(memory, "data_time_range")["notes"]
+    assert [note[:14] for note in notes] == [f"rec/rec_{number}.mcap" for number in range(2, 7)]
+    assert more == "2 older bags are odd too"
 
 
 def recording(folder: Path, *listed: tuple[str, int]) -> None:
