@@ -217,7 +217,7 @@ def _pruned(value: object, levels: int) -> object:
         return f"a number of {value.bit_length() * _DIGITS_PER_BIT:.0f} digits"
     if not isinstance(value, dict | list | tuple):
         return value
-    if not levels:
+    if value and not levels:
         return _ELLIPSIS
     is_longer = len(value) > _MAX_ITEMS
     if isinstance(value, dict):

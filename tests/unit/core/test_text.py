@@ -16,6 +16,7 @@ names = st.lists(st.text(st.sampled_from("/abAB\n"), max_size=12), max_size=8)
     [
         ([1, {"a": "b"}], '[1, {"a": "b"}]'),
         (nested(DEEP), '[[["…"]]]'),
+        ([[[[], {}, [0]]]], '[[[[], {}, "…"]]]'),
         (nested(DEEP, kind="object"), '{"x": {"x": {"x": "…"}}}'),
         (list(range(100)), '[0, 1, 2, 3, 4, 5, 6, 7, "…"]'),
         (10**4000, '"a number of 4000 digits"'),
