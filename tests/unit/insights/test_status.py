@@ -325,6 +325,10 @@ def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
     assert shown(memory)["doubts"] == SOUND
 
 
+def state_messages(bag: Path, count: int) -> None:
+    edit_summary(bag, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, count))
+
+
 def test_of_many_odd_bags_those_of_the_newest_are_named_whatever_is_odd(tmp_path: Path) -> None:
     for number in range(7):
         driven = along_x(BEGIN + 10 * number * S, 10, hz=10)
@@ -332,8 +336,7 @@ def test_of_many_odd_bags_those_of_the_newest_are_named_whatever_is_odd(tmp_path
         if number < 2:
             spoil_chunk(bag, 3)
             continue
-        wrong = struct.pack("<Q", 1000 + number)
-        edit_summary(bag, Opcode.STATISTICS, lambda body, to=wrong: body.__setitem__(slice(8), to))
+        state_messages(bag, 1000 + number)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 100 * S))
     asked(memory, "trajectory_summary", start=T0, end=T0 + 20)
     *notes, more = asked(memory, "data_time_range")["notes"]
