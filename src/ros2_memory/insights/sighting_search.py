@@ -113,6 +113,8 @@ class _NodeRuns:
         self.is_open = False
         # The log time of the oldest message; MAX_NS if it is unknown what follows an older one.
         self._begins: Ns = MAX_NS
+        # The log time of the oldest bound, and so of what ends a match before all of these.
+        self._bound: Ns = MAX_NS
 
     def tables(self, *, cut: bool) -> list[Ints]:
         """Returns tables of runs. With `cut` an oldest run that may go on has no known begin."""
@@ -129,19 +131,21 @@ class _NodeRuns:
         times, met = tested.times, tested.met
         ends = self._lasting.ends(np.append(times, after))
         goes_on = self.is_open and not ends[-1]
+        # Bounds are messages that do not match, or until which none lasts.
         is_bound = (met == NOT_MET) | np.append(False, ends[:-1])
         bounds, rows = np.flatnonzero(is_bound), np.flatnonzero(met == MET)
+        bound_times = np.append(times[bounds], after if ends[-1] else self._bound)
+        self._bound = int(bound_times[0])
         if not rows.size and not bounds.size:
             self.is_open = goes_on
             return
-        # Bounds are messages that do not match, or until which none lasts.
         next_bound = np.searchsorted(bounds, rows, side="right")
         starts = np.flatnonzero(self._apart | (np.diff(next_bound, prepend=-1) > 0))
         stops = np.append(starts, rows.size)[1:]
-        until = np.append(times[bounds], MAX_NS)[next_bound[stops - 1]]
+        until = bound_times[next_bound[stops - 1]]
         lasts = times[rows[stops - 1]]
         later = np.searchsorted(times[rows], lasts, side="right") - stops
-        columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later)
+        columns = (times[rows[starts]], lasts, stops - starts, until, later)
         runs = np.stack(np.broadcast_arrays(self._topic, *columns, 1, self._node), axis=1)[::-1]
         if goes_on and next_bound[-1:].tolist() == [bounds.size]:
             # The newest of these runs is the begin of the oldest one before.
@@ -155,7 +159,7 @@ class _NodeRuns:
 
     def end(self) -> None:
         """Ends the oldest run; it is not known what follows an older one."""
-        self.is_open, self._begins = False, MAX_NS
+        self.is_open, self._begins, self._bound = False, MAX_NS, MAX_NS
 
 
 class _TopicRuns:

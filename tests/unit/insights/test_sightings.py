@@ -51,6 +51,7 @@ from tests.support.bags import (
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import Remember, asked, clause, memory_of, noted, remembered
 from tests.support.tables import table
+from tests.unit.columns.test_long_arrays import joint_state
 
 S = 10**9
 T0 = 1_784_000_000
@@ -1000,6 +1001,20 @@ def test_a_topic_with_a_dot_in_its_name_is_read_beside_another(tmp_path: Path, n
         "sightings"
     ]
     assert "drive" in str(row["with"])
+
+
+@pytest.mark.parametrize("split", [10, 20, 30, 40])
+def test_a_message_that_cannot_be_decided_ends_no_sighting_in_another_bag(
+    tmp_path: Path, remember: Remember, split: int
+) -> None:
+    """Between a = 2 and a = 0 a state names b alone: all is as if they were in one bag."""
+    states = [*[("a", 0.0)] * 19, ("a", 2.0), ("b", 1.0), *[("a", 0.0)] * 9, *[("a", 2.0)] * 10]
+    messages = [joint_state(30 * n, [name], [value]) for n, (name, value) in enumerate(states)]
+    for nth, begin in enumerate(range(0, 40, split)):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[begin : begin + split])
+    sought = clause("/joints", "equals", 2.0, field="position.a")
+    rows = asked(remember(), "find_matches", **sought)["sightings"]
+    assert [(row["duration_s"], row["ended"]) for row in rows] == [(270.0, False), (0.0, False)]
 
 
 def test_each_call_of_a_tool_counts_however_soon_it_is_called_again(remember: Remember) -> None:
