@@ -343,9 +343,11 @@ def _readable_rows(base: sqlite3.Connection) -> int:
     """
     count = 0
     try:
-        for (payload,) in base.execute("SELECT data FROM messages NOT INDEXED ORDER BY rowid"):
-            if payload is None:  # the rest of a page that was cut reads as zeros
-                return count
+        for row in base.execute("SELECT rowid FROM messages NOT INDEXED ORDER BY rowid"):
+            with suppress(sqlite3.DataError):  # larger than allowed: that one alone is lost
+                payload, *_ = base.execute(_PAYLOAD, row).fetchone() or (None,)
+                if payload is None:  # the rest of a page that was cut reads as zeros
+                    return count
             count += 1
     except sqlite3.DatabaseError as error:
         if not count or sqlite_code(error) != sqlite3.SQLITE_CORRUPT:

@@ -169,6 +169,21 @@ def test_a_message_larger_than_allowed_costs_no_other_of_its_db3(
     assert [batch.log_times.tolist() for batch in batches] == [[5], [7]]
 
 
+def test_a_message_larger_than_allowed_costs_no_other_of_a_db3_that_was_cut_short(
+    tmp_path: Path,
+) -> None:
+    messages = [text(time, "x" * (2 * MB if time == 6 else 200)) for time in range(2000)]
+    path = write_db3(tmp_path / "run_0.db3", messages)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 9 // 10 // 4096 * 4096])
+    reader = Rosbag2Reader(max_chunk_mb=1)
+    count = reader.summarize(path).count
+    assert 100 < count < 2000
+    found, [lost] = read_through(reader.records(path, ["/chatter"], EVERYTHING))
+    assert [record.log_time for record in found] == [*range(6), *range(7, count)]
+    assert lost.lost == (6, 6)
+
+
 def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
