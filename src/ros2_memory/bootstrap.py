@@ -520,7 +520,16 @@ def build_memory(
     reading = reading_of(settings, shared.extractor.schemas)
     scanner = Scanner(columns, bag_dir, reading, shared.large, shared.caches)
     limits = query_settings_of(settings)
-    return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
+    return Memory(
+        index,
+        reader,
+        shared.extractor,
+        clock,
+        limits,
+        scanner,
+        large=shared.large,
+        hides_topics=bool(hidden),
+    )
 
 
 def build_columns(

@@ -130,6 +130,7 @@ class Memory:
         large: the turn to hold a large part of a bag in memory.
         memo: what was found out about the bags and stays true.
         fixed: the snapshot that answers all queries; None for the current one.
+        hides_topics: whether bags have topics of other robots, which are in no count.
     """
 
     index: SnapshotSource
@@ -141,6 +142,7 @@ class Memory:
     large: LargeReads = field(default_factory=LargeReads)
     memo: Memo = field(default_factory=Memo)
     fixed: Snapshot | None = None
+    hides_topics: bool = False
 
     @property
     def bag_dir(self) -> Path:
@@ -164,7 +166,10 @@ class Memory:
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns the splits that a recording's metadata.yaml lists and that are missing."""
-        return absent_splits(snapshot, self.bag_dir, self._listings())
+        absent = absent_splits(snapshot, self.bag_dir, self._listings())
+        if self.hides_topics:
+            return [each._replace(messages=0) for each in absent if each.files or each.unreadable]
+        return absent
 
     def store_listings(self, snapshot: Snapshot) -> None:
         """Stores what each metadata.yaml lists, so that the next start need not read them."""

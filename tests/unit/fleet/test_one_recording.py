@@ -11,7 +11,7 @@ from ros2_memory.bootstrap import shared_parts
 from ros2_memory.bootstrap_fleet import build_fleet, build_robots
 from ros2_memory.columns.store import FILE
 from ros2_memory.config import Settings, load_settings
-from tests.support.bags import Msg, detections, odom, tf_of, write_mcap
+from tests.support.bags import Msg, detections, odom, set_mtime, tf_of, write_mcap
 from tests.support.fleets import START_S, reply
 from tests.support.lakes import lake_rows, ship
 from tests.support.program import Program, exits
@@ -108,3 +108,17 @@ def test_columns_of_each_robot_are_in_a_store_of_its_own(
     assert {name: row["stored"] for name, row in told.items()} == {"r1": 1, "r2": 2}
     assert len([*(tmp_path / "cache").rglob(FILE)]) == 2
     test_each_robot_saw_and_records_what_is_its_own(settings)
+
+
+def test_messages_of_another_robot_are_not_missing(settings: Settings, tmp_path: Path) -> None:
+    files = "".join(f"  - path: rec_{n}.mcap\n    message_count: 20\n" for n in range(3))
+    listing = tmp_path / "bags" / "rec" / "metadata.yaml"
+    listing.write_text(f"rosbag2_bagfile_information:\n  files:\n{files}")
+    set_mtime(listing, FIRST)
+    fleet = build_fleet(settings)
+    assert fleet is not None
+    for name in SEEN:
+        notes = reply(fleet, "data_time_range", {"robot": name})["notes"]
+        assert [note for note in notes if "metadata.yaml" in note] == [
+            "metadata.yaml of rec lists 1 missing file"
+        ]
