@@ -6,7 +6,8 @@ them; but the span of the memory, and its newest moment, are computed without th
 
     before 2017          the clock was not set; if no bag has another date, it was simulated
     after now            the clock was ahead; if all bags are, this machine's clock is behind
-    set back by a day    the side of the step with fewer bags is wrong; of equals the earlier one
+    set back by a day    the side of the step with fewer bags of the recording is wrong; of equals
+                         the earlier one
     set ahead by 30 days during a recording: what it has from before that is wrong
 
 A clock that was set back by less is listed and leaves the span as it is. If this machine's own
@@ -34,6 +35,7 @@ from ros2_memory.index.split_order import splits_before_set_ahead
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
     from ros2_memory.index.timeline import Timeline
@@ -300,18 +302,29 @@ def _step_faults(
             continue
         first, last = fault.bag.start, fault.before.end
         after, before = (TimeWindow.around(at, FAR_BACK_NS // 2) for at in (first, last))
+        of_recording = _in_folder(timeline, str(fault.bag.recording))
         bags_after, bags_before = (
-            np.count_nonzero(side.overlapping(starts, ends)) for side in (after, before)
+            np.count_nonzero(side.overlapping(starts, ends) & of_recording)
+            for side in (after, before)
         )
         # Of equals the earlier one is wrong: a clock that loses its time falls back. Its dates
-        # begin, or end, at the step: what lies beyond was recorded at another time.
+        # begin, or end, at the step.
         if bags_after <= bags_before:
             wrong = TimeWindow(first, after.stop)
         else:
             wrong = TimeWindow(before.start, min(last + 1, MAX_NS))
-        are_strays |= wrong.overlapping(starts, ends)
+        are_strays |= wrong.overlapping(starts, ends) & of_recording
     strays = map(timeline.bags.__getitem__, np.flatnonzero(are_strays).tolist())
     yield from (ClockFault(bag, FaultyClock.STRAY) for bag in strays if bag.file not in faulty)
+
+
+def _in_folder(timeline: Timeline, folder: str) -> Flags:
+    """Returns which bags of a history lie in a folder."""
+    flags = [
+        np.array([name == folder for name in bags.folders])[bags.folder_of]
+        for bags in (segment.bags for segment in timeline.segments)
+    ]
+    return np.concatenate(flags)
 
 
 def _is_shown_within_bag(fault: ClockFault, within_bags: Mapping[str, ClockFault]) -> bool:

@@ -74,6 +74,21 @@ def test_what_was_recorded_two_days_later_is_not_dated_by_a_clock_that_was_set_b
     assert (found.earliest, found.misdated) == (before[0].start, frozenset({right[0].file}))
 
 
+@pytest.mark.parametrize("others", [10, 100])
+@pytest.mark.parametrize("apart", [-HOUR, HOUR])
+def test_a_clock_that_falls_back_into_another_recording_misdates_its_own_alone(
+    others: int, apart: int
+) -> None:
+    first = NOW - 2 * DAY
+    other = [odom_bag(f"/bags/b/b_{n}", at, at + S) for n in range(others) for at in [first + n * S]]
+    right = [bag(f"rec_{n}", NOW - HOUR + n * 10 * S) for n in range(30)]
+    wrong = [bag(f"rec_{n}", first - apart + n * 10 * S) for n in range(30, 35)]
+    step = StepBack(right[-1], wrong[0], right[-1].end - wrong[0].start)
+    found = check_dates(parted([*other, *right, *wrong]), (step,), NOW)
+    assert found.misdated == {each.file for each in wrong}
+    assert (found.earliest, found.latest) == (first, right[-1].end)
+
+
 def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> None:
     odd = [bag("sim", 5 * S), bag("boot", 6 * S, written=20 * S)]
     found = check_dates(parted([*GOOD, *odd]), (), NOW)
