@@ -174,14 +174,14 @@ def test_a_recording_that_ended_unasked_and_a_recorder_that_was_killed(tmp_path:
     robot.clock.at = T0 + 9 * S
     robot.house.note_restart(T0 + 8 * S, "died")
     robot.house.keep_moments()
-    assert robot.spans() == [(4, 12)]
+    assert robot.spans() == [(3, 12)]
     robot.clock.at = T0 + 39 * S
     robot.beat(robot.names[-1])
     robot.clock.at = T0 + 60 * S
     robot.house = robot.new_house()
     robot.house.prepare()
     robot.look()
-    assert robot.spans() == [(4, 12), (34, 63)]
+    assert robot.spans() == [(3, 12), (34, 63)]
     # One that was stopped ended as it should.
     robot.beat(state=RecorderState.STOPPED)
     robot.house = robot.new_house()
