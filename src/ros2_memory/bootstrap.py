@@ -503,7 +503,8 @@ def build_memory(
     shared = shared or shared_parts(settings)
     bag_dir = settings.recording.bag_dir
     reader = BagDirReader(shared.reader, bag_dir, hidden=hidden)
-    columns = build_columns(settings, reader, f"{bag_dir.absolute()} {hidden}" if hidden else None)
+    apart = (str(bag_dir.absolute()), str(hidden)) if hidden else ()
+    columns = build_columns(settings, reader, apart)
     index = IndexManager(
         bag_dir,
         reader,
@@ -533,7 +534,7 @@ def build_memory(
 
 
 def build_columns(
-    settings: Settings, reader: BagReader, apart: str | None = None
+    settings: Settings, reader: BagReader, apart: Sequence[str] = ()
 ) -> ColumnStore | None:
     """Returns the store of columns; None if the configuration wants none.
 
@@ -541,7 +542,7 @@ def build_columns(
         settings: the configuration.
         reader: leaves out what the bag directory hides: overlaps, and what `forget` deletes.
         apart: what identifies bags that are not those of the bag directory as they are. Their
-            store is in the cache folder.
+            store is in the cache folder; first comes the bag directory, if they lie there.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
@@ -549,8 +550,8 @@ def build_columns(
     if not settings.store.enabled:
         return None
     definitions = _hash_of(_definitions_of(settings))
-    if apart is not None:
-        cached = _cached(os.fsencode(apart))
+    if apart:
+        cached = _cached(*map(os.fsencode, apart))
         return ColumnStore(cached, reader.definition, definitions=definitions)
     bag_dir = settings.recording.bag_dir
     return ColumnStore(
@@ -579,10 +580,10 @@ def column_paths(settings: Settings) -> tuple[Path, ...]:
     return (*beside, *_cached(os.fsencode(bag_dir.absolute())))
 
 
-def _cached(name: bytes) -> tuple[Path, ...]:
+def _cached(*names: bytes) -> tuple[Path, ...]:
     """Returns the path of a store in the cache folder; nothing if there is no such folder.
 
-    `name` identifies the bags of the store.
+    `names` identify the bags of the store: there is a folder for each, inside the one before.
     """
     from ros2_memory.columns.store import FILE
 
@@ -591,7 +592,7 @@ def _cached(name: bytes) -> tuple[Path, ...]:
         cache = Path(given) if given else Path.home() / ".cache"
     except RuntimeError:  # a user without a home
         return ()
-    folder = cache / PACKAGE / hashlib.sha256(name).hexdigest()[:16]
+    folder = cache.joinpath(PACKAGE, *(hashlib.sha256(name).hexdigest()[:16] for name in names))
     return (folder / FILE,) if cache.is_absolute() else ()
 
 

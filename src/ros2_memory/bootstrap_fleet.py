@@ -189,7 +189,7 @@ def _shipped(memory: Memory, lake: Lake, own: Settings, name: str, shared: Share
 
     index = LakeIndex(lake, name, memory.bag_dir, memory.clock)
     reader = LakeReader(index, memory.reader, shared.large)
-    store = build_columns(own, shared.reader, f"{own.lake.warehouse} {name}")
+    store = build_columns(own, shared.reader, (f"{own.lake.warehouse} {name}",))
     reading = reading_of(own, shared.extractor.schemas)
     scanner = Scanner(store, index.bag_dir, reading, shared.large, shared.caches)
     return replace(memory, index=index, reader=reader, scanner=scanner, memo=Memo())

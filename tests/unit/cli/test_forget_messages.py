@@ -170,6 +170,17 @@ def test_nothing_of_it_is_left_anywhere(
     assert not [*bag_dir.rglob("*.repair"), *bag_dir.rglob("*.tmp")]
 
 
+def test_nothing_is_left_in_the_stores_of_robots_that_share_the_bags(
+    tmp_path: Path, bag_dir: Path, forget: Forget, exits: Program
+) -> None:
+    robots = f"fleet.robots={{r1: {bag_dir}, r2: {bag_dir}}}"
+    exits(0, "index", "deployment=fleet", robots)
+    stores = {each for each in traces(tmp_path, SAID) if each.endswith(FILE)}
+    assert len(stores) == 2
+    forget(0, 0, 100, OF_CAMERA)
+    assert traces(tmp_path, SAID) == []
+
+
 @pytest.mark.parametrize("write", [write_mcap, write_db3])
 def test_beside_a_message_that_is_as_large_as_is_allowed(
     bag_dir: Path, forget: Forget, write: Callable[[Path, list[Msg]], Path]

@@ -80,7 +80,7 @@ def test_a_clock_that_falls_back_into_another_recording_misdates_its_own_alone(
     others: int, apart: int
 ) -> None:
     first = NOW - 2 * DAY
-    other = [odom_bag(f"/bags/b/b_{n}", at, at + S) for n in range(others) for at in [first + n * S]]
+    other = [odom_bag(f"/bags/b/b_{n}", first + n * S, first + (n + 1) * S) for n in range(others)]
     right = [bag(f"rec_{n}", NOW - HOUR + n * 10 * S) for n in range(30)]
     wrong = [bag(f"rec_{n}", first - apart + n * 10 * S) for n in range(30, 35)]
     step = StepBack(right[-1], wrong[0], right[-1].end - wrong[0].start)

@@ -532,7 +532,9 @@ class _Forget:
         if not self._dry_run:
             names = [*files]
             for path in column_paths(self._settings):
-                forget_columns(path, self._bag_dir, names)
+                # Each robot of a fleet whose bags lie in one folder has a store of its own.
+                for store in (path, *path.parent.glob(f"*/{path.name}")):
+                    forget_columns(store, self._bag_dir, names)
 
     def _name(self, bag: BagFile | SetAside | Path) -> str:
         """Returns a path relative to the bag directory; one outside of it as it is."""
