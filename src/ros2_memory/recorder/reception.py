@@ -340,15 +340,20 @@ class Reception:
             if state is not None:
                 state.refused.add(topic)
 
-    def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
-        """Returns why a recording should be rotated now; None if there is no reason."""
+    def rotation_due(
+        self, recording: str, now_s: float, subscribed: Collection[str] = ()
+    ) -> Rotation | None:
+        """Returns why a recording should be rotated now; None if there is no reason.
+
+        `subscribed` are the topics that the recording has subscribed to.
+        """
         with self._lock:
             state = self._recordings.get(recording)
             if state is None:
                 return None
             weak = state.refused & self._asked_anew.keys()
             # The publisher of the type that was subscribed to has gone.
-            gone = state.of_types and self._arrivals.silent_topics(0).intersection(state.of_types)
+            gone = {*state.of_types}.intersection(subscribed, self._arrivals.silent_topics(0))
             refused = [
                 topic
                 for topic in sorted(weak.union(gone))

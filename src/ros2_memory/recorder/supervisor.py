@@ -310,7 +310,9 @@ class Supervisor:
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
         is_over = current.age_s(now) >= self.orders.session_duration_s
-        resubscribe = self._reception.rotation_due(current.name, now.monotonic_s)
+        resubscribe = self._reception.rotation_due(
+            current.name, now.monotonic_s, current.subscribed
+        )
         is_wanted = self._sessions.must_rotate or is_silent or is_over or resubscribe is not None
         is_alone = self._sessions.handover is None
         may_rotate = is_alone and current.is_recording and current.splits.exists

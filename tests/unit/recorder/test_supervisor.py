@@ -399,6 +399,23 @@ def test_a_topic_whose_publishers_have_another_type_now_is_subscribed_to_again(
     assert world.heartbeat()["fell_silent"] == []
 
 
+def test_while_publishers_keep_disagreeing_a_recording_that_never_subscribed_is_not_rotated(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path)
+    world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
+    world.started(60)
+    [old] = world.running
+    old.heard = world.defaults["topics"] = world.defaults["heard"] = ("/bumper",)
+    with capture_logs() as logs:
+        while world.mono < 1_500:
+            for recorder in world.running:
+                recorder.lines.append(SEVERAL_TYPES.format("/door"))
+            world.run(0.5)
+    assert [len(events(logs, name)) for name in ("asking_again", "rotated")] == [1, 1]
+    assert world.heartbeat()["unknown_types"] == ["/door"]
+
+
 def test_a_heartbeat_that_cannot_be_written_is_reported_once_and_recording_goes_on(
     world: World,
 ) -> None:
