@@ -47,8 +47,6 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader
 
@@ -115,7 +113,7 @@ class ScanContext:
     open_recordings: frozenset[str] | None = None
     include_active: bool = False
     trusts_mtime: bool = True
-    _listed: dict[Path, Collection[str]] = field(default_factory=dict)
+    _listed: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     @property
     def settling_ns(self) -> Ns:
@@ -139,9 +137,9 @@ class ScanContext:
         """Returns whether the metadata.yaml beside a file lists it."""
         folder = path.parent
         if folder not in self._listed:
-            self._listed[folder] = ()
+            self._listed[folder] = frozenset()
             with suppress(OSError, ValueError):
-                self._listed[folder] = read_listing(folder / METADATA_FILE).names
+                self._listed[folder] = frozenset(read_listing(folder / METADATA_FILE).names)
         return path.name in self._listed[folder]
 
 
