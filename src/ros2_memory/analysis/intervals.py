@@ -180,10 +180,11 @@ class IntervalTable(NamedTuple):
     def of_each_label(self) -> list[tuple[VisibleInterval, int, Ns]]:
         """Returns for each label the time from first to last, how many intervals, and their length.
 
-        The time has no score. Intervals of fewer than `_FEWEST` messages do not count: detectors
-        are wrong now and then.
+        The time has no score. Intervals of fewer than `_FEWEST` messages do not count where others
+        have more: detectors are wrong now and then. One that says each visitor once has no others.
         """
-        spans = self._select(self._array["count"] >= _FEWEST).spans()
+        counts = self._array["count"]
+        spans = self._select(counts >= min(_FEWEST, counts.max(initial=0))).spans()
         return [
             (
                 VisibleInterval(label, int(first[0]), int(last.max()), None),

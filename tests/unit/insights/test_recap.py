@@ -326,6 +326,18 @@ def test_things_that_are_passed_by_are_events_however_many_they_are(tmp_path: Pa
     assert len(reply["events"]) == 25
 
 
+@pytest.mark.parametrize(("hours", "visits"), [(60, 2), (10, MOST_EVENTS + 1)])
+def test_the_visits_that_a_detector_says_in_one_message_each_are_listed(
+    tmp_path: Path, hours: int, visits: int
+) -> None:
+    """A detector at the door has a message of each visitor, and no others."""
+    length = 3600 * hours
+    said = [odom(BEGIN + at * S, 0.0) for at in range(0, length, 300)]
+    said += [detections(BEGIN + nth * length // visits * S, ["person"]) for nth in range(visits)]
+    [event] = over(remembered(tmp_path, in_order(said)), 0, length).events
+    assert event.text == f"person in view ({visits} times, 0 s in all)"
+
+
 @pytest.mark.parametrize(("hours", "is_listed"), [(60, True), (40, False)])
 def test_a_thing_that_was_seen_once_in_days_is_listed_beside_what_happens_all_the_time(
     tmp_path: Path, hours: int, is_listed: bool
