@@ -62,6 +62,7 @@ from ros2_memory.history.driven_path import (
     body_at,
     body_of,
     driven_path,
+    follow,
     newest_of_body,
     no_path,
     resolve_path_topic,
@@ -869,8 +870,7 @@ def trajectory_summary(
     one for 1. `farthest` is the point from which the farthest pose is wanted.
     """
     view, window = open_span(memory, call, span)
-    view.followed = topic
-    name = resolve_path_topic(view)
+    name = follow(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None:
         raise no_path(view, name, window)

@@ -16,6 +16,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import (
+    follow,
     no_path,
     path_by_poses,
     resolve_path_topic,
@@ -79,8 +80,7 @@ def count_path(
     """
     place_asked = None if where is None else parse_where(memory.limits, where)
     view, asked = open_span(memory, call, span)
-    view.followed = topic
-    name = resolve_path_topic(view)
+    name = follow(view, topic)
     binned = BinnedWindow(view, asked, by, (name,), place_asked)
     path, since = path_by_poses(view, name, binned.counted)
     if path is None or not path.poses:

@@ -53,6 +53,7 @@ from ros2_memory.history.no_data import (
     describe_lack,
     no_data_between,
     resolve_pose_topic,
+    resolve_topic,
     undecodable,
     with_notes,
 )
@@ -496,6 +497,17 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
     if body.beside:
         view.notes.add(f"not of {listed(body.beside)}, as of other robots")
     return name or topics[0]
+
+
+def follow(view: View, topic: str | None) -> str:
+    """Returns the topic of the path that is asked about, of which all places of the call are then.
+
+    Raises:
+        NoDataError: as for `resolve_pose_topic`.
+    """
+    if topic is not None:
+        view.followed = resolve_topic(view, topic)
+    return resolve_path_topic(view)
 
 
 def newest_of_body(

@@ -31,7 +31,7 @@ from ros2_memory.core.regions import places_at
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns, Span, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
-from ros2_memory.history.driven_path import driven_path, no_path, resolve_path_topic
+from ros2_memory.history.driven_path import driven_path, follow, no_path
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.places.pose_frames import (
@@ -100,8 +100,7 @@ def driven_inside(
     """
     place = None if where is None else parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
-    view.followed = topic
-    name = resolve_path_topic(view)
+    name = follow(view, topic)
     path, _ = driven_path(view, name, window)
     if path is None or not path.poses:
         raise no_path(view, name, window)

@@ -374,13 +374,14 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
         assert each["yaw_deg"] == there["yaw_deg"]
 
 
+@pytest.mark.parametrize("topic", ["/drone/odom", "drone/odom"])
 def test_the_places_of_a_path_are_those_of_the_topic_that_is_asked_about(
-    remember: Remember,
+    remember: Remember, topic: str
 ) -> None:
     """A drone flies 20 m along x and lands, while the robot of the same memory stands at 0."""
     flight = [odom(T0 + n * S, min(n, 20), topic="/drone/odom") for n in range(60)]
     memory = remember([*along_x(T0, 60), *flight])
-    window = {"topic": "/drone/odom", "start": T0 / S, "end": T0 / S + 59}
+    window = {"topic": topic, "start": T0 / S, "end": T0 / S + 59}
     ask = partial(asked, memory, "trajectory_summary", **window)
     pad = {"x": [15, 25], "y": [-1, 1]}
     landing = ask(where=pad)
