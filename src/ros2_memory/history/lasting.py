@@ -15,6 +15,7 @@ It ends before that, in this order:
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from heapq import nlargest
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import proxy
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 TEXT: Final = "std_msgs/msg/String"
 _MOST_PACED: Final = 1000
 """The newest messages of a session that say whether a topic is regular."""
+_MOST_JUDGED: Final = 20
+"""The newest sessions that say whether the texts of a topic are events."""
 
 
 class _Heard(NamedTuple):
@@ -174,12 +177,14 @@ def _heard_in(view: View, topic: str) -> list[_Heard]:
 
 def _pause_in(view: View, topic: str, heard: _Heard) -> Ns:
     """Returns the `pause_of` the newest messages of a topic in a session."""
+    if heard.messages < PACED:
+        return SILENCE_NS
     known = view.timeline.memo.of(_PAUSES, dict)
     if (topic, heard) not in known:
         parts: list[IntArray] = [np.empty(0, np.int64)]
         window = TimeWindow(heard.start, heard.stop)
         scanned = open_scan(view, topic, window, columns=False).rows(newest_first=True)
-        for rows in scanned if heard.messages >= PACED else ():
+        for rows in scanned:
             parts.append(rows.times)
             if sum(map(len, parts)) > _MOST_PACED:
                 break
@@ -252,9 +257,10 @@ def is_text(view: View, topic: str) -> bool:
 def says_events(view: View, topic: str) -> bool:
     """Returns whether each message of a topic is an event: of a log, or a text now and then.
 
-    Texts that come regularly, or more often than every `SILENCE_NS`, describe what goes on.
+    Texts that come regularly, or more often than every `SILENCE_NS`, describe what goes on. The
+    newest sessions say so: there may be thousands.
     """
-    heard = _heard_in(view, topic) if is_text(view, topic) else []
+    heard = nlargest(_MOST_JUDGED, _heard_in(view, topic)) if is_text(view, topic) else []
     length = sum(each.stop - each.start for each in heard)
     is_seldom = length > SILENCE_NS * sum(each.messages for each in heard)
     is_paced = any(

@@ -393,8 +393,8 @@ def _run_spans(view: View, search: ReverseSearch, scope: Scope) -> SightingSpans
     firsts, lasts, are_begun = spans.T  # views: what is set in them is set in `spans`
     # Without a scope the oldest may have begun before what there was time to search.
     are_begun |= not scope.is_bounded
-    is_log = np.array([*map(view.timeline.is_log, topics)], np.bool_)
-    states = np.flatnonzero(~is_log[searched_runs.table[:, 0]])
+    are_events = np.array([says_events(view, topic) for topic in topics], np.bool_)
+    states = np.flatnonzero(~are_events[searched_runs.table[:, 0]])
     known = 0
     oldest: dict[tuple[str, int], tuple[int, Run]] = {}
     try:
@@ -551,10 +551,10 @@ def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage 
 def _lasted_until(view: View, condition: Condition, run: Run, scope: Scope) -> Ns:
     """Returns until when (ns) a match lasted: until a message says otherwise, or the window ends.
 
-    A log entry does not last, and nothing does beyond the scope.
+    An event does not last, and nothing does beyond the scope.
     """
     last, states, (_, end) = run.last, is_flag(condition), scope.window.asked()
-    if view.timeline.is_log(run.topic):
+    if says_events(view, run.topic):
         return last
     lasting = lasting_of(view, run.topic, states=states)
     if run.until < MAX_NS:
@@ -569,7 +569,7 @@ def _lasted_until(view: View, condition: Condition, run: Run, scope: Scope) -> N
 
 def _is_ended(view: View, run: Run, until: Ns) -> bool:
     """Returns whether a message ended a state at a log time, or it is of a moment alone."""
-    if view.timeline.is_log(run.topic) or _is_said_once(view, run):
+    if says_events(view, run.topic) or _is_said_once(view, run):
         return True
     at = TimeWindow(until, until + 1)
     return until > run.last and view.stream.first([run.topic], at) is not None

@@ -1025,6 +1025,7 @@ def test_each_call_of_a_tool_counts_however_soon_it_is_called_again(remember: Re
     memory = remember(in_order([*said, *beats]))
     sought = {"condition_type": "equals", "field": "data.tool", "value": "grasp"}
     rows = asked(memory, "find_matches", topic="/trace", by="day", **sought)
-    assert table(rows)["all"]["count"] == 3
+    assert (table(rows)["all"]["count"], table(rows)["all"]["seconds"]) == (3, 0.0)
     found = asked(memory, "find_matches", topic="/trace", **sought)
+    assert {row["duration_s"] for row in found["sightings"]} == {0.0}
     assert [row["last_seen"] - T0 for row in found["sightings"]] == [70.0, 48.0, 40.0]
