@@ -45,8 +45,10 @@ _TRIED: Final = 7
 """So many messages are looked for in the other recording: a subscriber may miss some."""
 _FEWEST_SHIFTED: Final = 2
 """So many different messages show that two clocks differ: two robots, too, say one alike."""
-_CLOCK_DRIFT_NS: Final = 200 * NS_PER_MS
-"""The difference of two clocks changes by less than this while both record."""
+_JITTER_NS: Final = 200 * NS_PER_MS
+"""Two recorders of one clock receive a message at times that differ by less than this."""
+_DRIFT: Final = 10_000
+"""Two clocks drift apart by less than one in so many: of crystals, 100 parts per million."""
 _MAX_PAIRS: Final = 20
 """At most so many pairs of recordings are compared for the whole memory."""
 _MAX_TOPICS: Final = 3
@@ -583,7 +585,8 @@ def _shift_of_clock(view: View, topic: str, pair: tuple[Path, Path], span: TimeW
                 payloads.add(payload)
                 shifts += equal
     are_enough = len(payloads) >= _FEWEST_SHIFTED and 2 * len(shifts) > len(sample)
-    is_alike = are_enough and max(shifts) - min(shifts) <= _CLOCK_DRIFT_NS
+    most = _JITTER_NS + (span.stop - span.start) // _DRIFT
+    is_alike = are_enough and max(shifts) - min(shifts) <= most
     shift = sorted(shifts)[len(shifts) // 2] if is_alike else None
     if reading.is_final and len(remembered) < MOST_REMEMBERED:
         remembered[key] = shift

@@ -318,7 +318,7 @@ def _run_sightings(
     view.notes.retract_outside(searched)
     found = _found_in(view, search, runs, scope, selection.frame_id)
     sightings = _with_fields(view, found, selection.fields)
-    view.notes.add(*_flicker_notes(view, search, runs), *_doubtful_notes(sightings))
+    view.notes.add(*_flicker_notes(view, search, runs), *_doubtful_notes(runs, sightings))
     return _SelectedRows(total, searched, sightings)
 
 
@@ -513,10 +513,18 @@ def _flicker_notes(view: View, search: ReverseSearch, runs: Sequence[Run]) -> It
         )
 
 
-def _doubtful_notes(sightings: Sequence[Sighting]) -> Iterator[str]:
-    """Yields that most sightings are one detection of a low score, between messages without it."""
-    lone = (one.score for one in sightings if one.messages == 1 and one.begun)
-    doubtful = sum(score is not None and score < _SURE for score in lone)
+def _doubtful_notes(runs: Iterable[Run], sightings: Sequence[Sighting]) -> Iterator[str]:
+    """Yields that most sightings are one detection of a low score, between messages without it.
+
+    A detector that publishes what is new alone has no message without it soon after.
+    """
+    lone = {
+        (run.topic, run.last)
+        for run in runs
+        if run.messages == 1 and run.begun and run.until - run.last <= FLICKER_NS
+    }
+    scores = (one.score for one in sightings if (one.topic, one.last) in lone)
+    doubtful = sum(score is not None and score < _SURE for score in scores)
     if 2 * doubtful > len(sightings):
         yield (
             f"{counted(doubtful, 'sighting')} of one message alone may be an error of the "

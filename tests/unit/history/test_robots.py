@@ -419,6 +419,22 @@ def test_a_recorder_whose_clock_is_ahead_makes_no_second_robot(tmp_path: Path) -
         assert "several robots" not in str([path, visited])
 
 
+def test_recorders_whose_clocks_drift_apart_are_of_one_robot(tmp_path: Path) -> None:
+    """Of two hours: the clock of the station is 3 s ahead, and 0.05 s more each 1,000 s."""
+    driven = along_x(T0, 7_200, mps=0.5)
+    record(tmp_path, "rover", driven)
+    ahead = [
+        replace(each, log_time=at, publish_time=at)
+        for each in driven
+        for at in [each.log_time + 3 * S + (each.log_time - T0) // 20_000]
+    ]
+    record(tmp_path, "station", ahead)
+    whole = {"start": T0 / S, "end": T0 / S + 7_200}
+    path = asked(memory_of(tmp_path), "trajectory_summary", **whole)
+    assert path["distance_m"] == pytest.approx(3_600, abs=5)
+    assert noted(path, "two recorders have the same messages of /odom 3.2 s apart")
+
+
 def test_equal_messages_of_a_recorder_count_though_one_was_received_as_it_was_published(
     tmp_path: Path,
 ) -> None:

@@ -95,6 +95,12 @@ def test_most_sightings_of_one_message_and_a_low_score_are_called_doubtful(
     )
 
 
+def test_a_detector_that_publishes_what_is_new_alone_makes_no_single_errors(tmp_path: Path) -> None:
+    seen = [detections(BEGIN + at * S, ["person"], score=0.5) for at in (10, 100, 200)]
+    found = asked(remembered(tmp_path, seen), "find_matches", **clause(OBJECTS, "equals", "person"))
+    assert (found["total"], noted(found, "an error of the detector")) == (3, [])
+
+
 def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     seen, limits = [detections(BEGIN, ["cup"], score=0.2)], QuerySettings(min_score=0.5)
     memory = remembered(tmp_path, seen, limits=limits)
