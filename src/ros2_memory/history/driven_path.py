@@ -469,7 +469,7 @@ def body_by_transforms(view: View) -> Body | None:
     Transforms place it if no topic has its poses, or if the topic that places it is one of theirs.
     """
     body = body_of(view, view.followed or view.pose_topic)
-    if body is None and not view.has_poses:
+    if body is None and view.followed is None and not view.has_poses:
         return robot_body(view)
     return body
 

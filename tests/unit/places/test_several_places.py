@@ -394,6 +394,17 @@ def test_the_places_of_a_path_are_those_of_the_topic_that_is_asked_about(
     assert rows["pad"]["recorded_s"] == pytest.approx(44.0, abs=0.1)
 
 
+def test_the_places_of_the_path_of_a_marker_are_not_those_of_a_robot_placed_by_transforms(
+    remember: Remember,
+) -> None:
+    marker = [odom(T0 + n * S, min(n, 20), topic="/marker/pose") for n in range(60)]
+    standing = [tf_of(T0 + n * S, "odom", "base_link", (0, 0, 0)) for n in range(60)]
+    window = {"topic": "/marker/pose", "start": T0 / S, "end": T0 / S + 59}
+    ask = partial(asked, remember([*marker, *standing]), "trajectory_summary", **window)
+    assert ask(farthest_from={"x": 0, "y": 0})["farthest"]["distance_m"] == 20.0
+    assert ask(where={"x": [15, 25], "y": [-1, 1]})["distance_m"] == pytest.approx(5.0, abs=0.1)
+
+
 @settings(max_examples=examples(8))
 @given(
     seed=st.integers(0, 10_000),
