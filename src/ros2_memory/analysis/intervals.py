@@ -179,11 +179,13 @@ class IntervalTable(NamedTuple):
     def of_each_label(self) -> list[tuple[VisibleInterval, int, Ns]]:
         """Returns for each label the time from first to last, how many intervals, and their length.
 
-        The time has no score. Intervals of fewer than `_FEWEST` messages do not count where others
-        have more: detectors are wrong now and then. One that says each visitor once has no others.
+        The time has no score. Intervals of fewer than `_FEWEST` messages do not count where the
+        label has others: detectors are wrong now and then. A door sees a visitor once.
         """
-        counts = self._array["count"]
-        spans = self._select(counts >= min(_FEWEST, counts.max(initial=0))).spans()
+        labels, counts = self._array["label"], self._array["count"]
+        most = np.zeros(len(self.labels), counts.dtype)
+        np.maximum.at(most, labels, counts)
+        spans = self._select(counts >= np.minimum(_FEWEST, most)[labels]).spans()
         return [
             (
                 VisibleInterval(label, int(first[0]), int(last.max()), None),

@@ -551,11 +551,9 @@ def _things_in_view(
         events = [_sight_event(last_seen, interval) for interval in things.longest(most)]
     else:
         events = [_sight_event(last_seen, *of_label) for of_label in of_labels]
-        steady = {one.label for one, *_ in of_labels}
-        events += [
-            _sight_event(last_seen, one) for one in longest_of_each if one.label not in steady
-        ]
-    brief = {one.label for one, *_ in of_labels if one.last - one.first <= NS_PER_HOUR}
+    brief = {
+        one.label for one, _, length in of_labels if length and one.last - one.first <= NS_PER_HOUR
+    }
     once = [event for event in events if is_long and event.label in brief]
     return _ThingsInView(
         events,

@@ -326,16 +326,20 @@ def test_things_that_are_passed_by_are_events_however_many_they_are(tmp_path: Pa
     assert len(reply["events"]) == 25
 
 
+@pytest.mark.parametrize("camera", [False, True])
 @pytest.mark.parametrize(("hours", "visits"), [(60, 2), (10, MOST_EVENTS + 1)])
 def test_the_visits_that_a_detector_says_in_one_message_each_are_listed(
-    tmp_path: Path, hours: int, visits: int
+    tmp_path: Path, hours: int, visits: int, *, camera: bool
 ) -> None:
-    """A detector at the door has a message of each visitor, and no others."""
+    """A detector at the door has a message of each visitor, and no others; a camera has a clock."""
     length = 3600 * hours
     said = [odom(BEGIN + at * S, 0.0) for at in range(0, length, 300)]
     said += [detections(BEGIN + nth * length // visits * S, ["person"]) for nth in range(visits)]
-    [event] = over(remembered(tmp_path, in_order(said)), 0, length).events
-    assert event.text == f"person in view ({visits} times, 0 s in all)"
+    clock = [detections(BEGIN + (900 + at) * S, ["clock"], topic="/camera") for at in range(9)]
+    said += clock if camera else []
+    events = over(remembered(tmp_path, in_order(said)), 0, length).events
+    persons = f"person in view ({visits} times, 0 s in all)"
+    assert [event.text for event in events] == [persons, *["clock in view"] * camera]
 
 
 @pytest.mark.parametrize(("hours", "is_listed"), [(60, True), (40, False)])
