@@ -368,8 +368,8 @@ def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | 
             return node
         if Selector.of(segment) is not None:
             raise UnknownShapeError(f"which elements {segment} selects depends on the message")
-        if isinstance(node, list) and segment.isascii() and segment.isdecimal():
-            node = next(iter(_picked(node, segment[:9]) or ()), NOTHING)
+        if isinstance(node, list) and INDEX.fullmatch(segment):
+            node = next(iter(_picked(node, segment) or ()), NOTHING)
             continue
         if isinstance(node, Listing):
             inner = _descend(node.element, path[nth:], parts=parts)
