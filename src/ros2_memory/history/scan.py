@@ -17,9 +17,8 @@ from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, Siz
 from ros2_memory.columns.scan import Scan, Stretch
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
-from ros2_memory.core.arrays import concatenated, run_starts
+from ros2_memory.core.arrays import concatenated
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, Span
@@ -417,22 +416,6 @@ def _nth_messages(
     begins = np.cumsum([0, *map(len, tables)])
     times = concatenated(rows.times for rows in tables)
     order = np.argsort(times, kind="stable")
-    wanted = order[numbers[numbers < times.size]]  # a bag may be deleted since
-    table_of = np.searchsorted(begins, wanted, side="right") - 1
-    bag_of = concatenated(rows.unit.bag_numbers()[rows.positions] for rows in tables)[wanted]
-    starts = run_starts(table_of, bag_of)
-    for table, run in zip(table_of[starts].tolist(), np.split(wanted, starts[1:]), strict=False):
-        yield from _messages_of_bag(view, tables[table].some(run - begins[table]))
-
-
-def _messages_of_bag(view: View, rows: Rows) -> Iterator[StoredMessage]:
-    """Yields the messages of rows of one bag, in log-time order.
-
-    Where they lie close together, they are read at once: each alone would have its chunk, and of a
-    large one all of it, decompressed again.
-    """
-    [(bag, _)] = rows.bag_rows()
-    is_close = bag.size <= LARGE_BYTES * len(rows)
-    parts = [rows] if is_close else [rows.some(np.array([nth])) for nth in range(len(rows))]
-    for part in parts:
-        yield from messages_of(view, part)
+    for row in order[numbers[numbers < times.size]].tolist():  # a bag may be deleted since
+        table = int(np.searchsorted(begins, row, side="right")) - 1
+        yield from messages_of(view, tables[table].some(row - begins[table : table + 1]))

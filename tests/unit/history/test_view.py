@@ -21,10 +21,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import Record
-from ros2_memory.storage.errors import SizeLimit
-from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap import bag_file, bulk
-from ros2_memory.storage.mcap.chunk import Chunk, chunk_data
+from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
@@ -155,23 +152,6 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         last = View(memory, Call()).stream.newest(TOPIC, EVERYTHING)
         assert last is not None
         assert last.time == counted[-1][0]
-
-
-def test_a_chunk_that_no_cache_holds_is_decompressed_once_for_all_messages_that_are_picked(
-    remember: Remember, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    messages = [text(nth * S, f"{nth}") for nth in range(1, 201)]
-    memory = remember(messages, reader=McapReader(cache_mb=0))
-    view = View(memory, Call())
-    total, chosen = pick(view, "/chatter", EVERYTHING, 100)
-    decompressed: list[int] = []
-
-    def count(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
-        decompressed.append(chunk.offset)
-        return chunk_data(file, chunk, limit)
-
-    monkeypatch.setattr(bag_file, "chunk_data", count)
-    assert (total, len([*chosen]), len(decompressed)) == (200, 100, 1)
 
 
 def test_a_message_that_three_recordings_received_late_counts_as_often_by_each_way(
