@@ -488,7 +488,7 @@ def build_memory(
         settings: the configuration.
         shared: the parts that it shares with other memories; None for parts of its own.
         setting: the setting in which the user named the bags; None for `recording.bag_dir`.
-        hidden: how topics begin that are left out.
+        hidden: prefixes of the topics that are left out, as those of another robot.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
@@ -541,8 +541,8 @@ def build_columns(
     Args:
         settings: the configuration.
         reader: leaves out what the bag directory hides: overlaps, and what `forget` deletes.
-        apart: what identifies bags that are not those of the bag directory as they are. Their
-            store is in the cache folder; first comes the bag directory, if they lie there.
+        apart: names of a store in the cache folder: of a robot in a lake, or of one of several in a
+            bag directory, which is the first name. Empty for the store of the bag directory.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore

@@ -216,7 +216,7 @@ def robot_settings(settings: Settings, name: str) -> Settings:
 
 
 def hidden_topics(settings: Settings, name: str) -> tuple[str, ...]:
-    """Returns how topics begin that belong to other robots in the same bags: with their names."""
+    """Returns the prefixes of topics of other robots in the same bags: `/NAME/`."""
     robots = settings.fleet.robots
     return tuple(
         f"/{other}/"

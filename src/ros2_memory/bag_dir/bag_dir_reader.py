@@ -68,7 +68,7 @@ class BagDirReader(BagReader):
         reader: the adapter, which decodes messages.
         bag_dir: the directory that paths must lie in, which may be a link; None allows any path.
         every_message: ignores `handover.json`, so that counts are those of the files.
-        hidden: how topics begin that are in no summary and no list of channels.
+        hidden: prefixes of the topics that are in no summary and no list of channels.
     """
 
     reader: BagReader

@@ -262,7 +262,7 @@ def open_memory(
         allows_fleet: whether the command also asks the robots of a fleet, whose memory has no bags
             of its own, and no index.
         setting: the setting that names the bags, if it is not `recording.bag_dir`.
-        hidden: how topics begin that are left out.
+        hidden: prefixes of the topics that are left out.
 
     Raises:
         ConfigError: an adapter cannot be built.

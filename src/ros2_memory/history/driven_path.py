@@ -466,7 +466,8 @@ def body_of(view: View, topic: str) -> Body | None:
 def body_by_transforms(view: View) -> Body | None:
     """Returns the robot's body if transforms place it; None if a topic of poses does.
 
-    Transforms place it if no topic has its poses, or if the topic that places it is one of theirs.
+    Transforms place it if no topic has its poses, or if the topic of poses that the question or
+    `data.pose_topic` names is one of transforms.
     """
     body = body_of(view, view.followed or view.pose_topic)
     if body is None and view.followed is None and not view.has_poses:
@@ -500,7 +501,11 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
 
 
 def follow(view: View, topic: str | None) -> str:
-    """Returns the topic of the path that is asked about, of which all places of the call are then.
+    """Returns the topic of the path, and makes the places of this call those of its poses.
+
+    Args:
+        view: of this call.
+        topic: the topic that the question names; None for the robot's own.
 
     Raises:
         NoDataError: as for `resolve_pose_topic`.

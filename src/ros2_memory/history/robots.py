@@ -564,8 +564,8 @@ def _extents_of(
 def _shift_of_clock(view: View, topic: str, pair: tuple[Path, Path], span: TimeWindow) -> Ns | None:
     """Returns how much later (ns) the second of two recordings has the messages of the first.
 
-    None if it has others, by a sample of poses, or else of the topic: most of what the first has
-    once around the other has once, too, and as much later.
+    None if it has other messages. A sample decides, of poses if both have them, else of the topic:
+    more than half of it is in the other recording, each message once, and all equally late.
     """
     if _recordings_with(view, view.pose_topic).keys() >= {*pair}:
         topic = view.pose_topic

@@ -113,7 +113,7 @@ class _NodeRuns:
         self.is_open = False
         # The log time of the oldest message; MAX_NS if it is unknown what follows an older one.
         self._begins: Ns = MAX_NS
-        # The log time of the oldest bound, and so of what ends a match before all of these.
+        # The log time of the oldest message that ends a match before it; MAX_NS if none is known.
         self._bound: Ns = MAX_NS
 
     def tables(self, *, cut: bool) -> list[Ints]:
